@@ -1,0 +1,95 @@
+#include "dendro_slam/geometry/se3.h"
+
+#include <cmath>
+
+#include "dendro_slam/geometry/so3.h"
+
+namespace dendro {
+
+namespace {
+
+// Left Jacobian of SO(3): the V of Exp, translation = V rho.
+Eigen::Matrix3d LeftJacobianSo3(const Eigen::Vector3d& omega) { return RightJacobianSo3(-omega); }
+
+// Barfoot's Q block of the left Jacobian (State Estimation for Robotics, eq. 7.86), rotation first.
+Eigen::Matrix3d LeftQ(const Eigen::Vector3d& omega, const Eigen::Vector3d& rho) {
+  const Eigen::Matrix3d W = Skew(omega);
+  const Eigen::Matrix3d P = Skew(rho);
+  const double theta2 = omega.squaredNorm();
+  double c1 = 1.0 / 6.0 - theta2 / 120.0;
+  double c2 = 1.0 / 24.0 - theta2 / 720.0;
+  double c3 = 1.0 / 120.0 - theta2 / 2520.0;
+  // The closed forms cancel badly below a few hundredths of a radian.
+  if (theta2 >= 1e-3) {
+    const double theta = std::sqrt(theta2);
+    const double s = std::sin(theta);
+    const double c = std::cos(theta);
+    const double theta4 = theta2 * theta2;
+    c1 = (theta - s) / (theta2 * theta);
+    c2 = (theta2 + 2.0 * c - 2.0) / (2.0 * theta4);
+    c3 = (2.0 * theta - 3.0 * s + theta * c) / (2.0 * theta4 * theta);
+  }
+  return 0.5 * P + c1 * (W * P + P * W + W * P * W) + c2 * (W * W * P + P * W * W - 3.0 * W * P * W) +
+         c3 * (W * P * W * W + W * W * P * W);
+}
+
+}  // namespace
+
+Eigen::Isometry3d ExpSe3(const Vector6d& xi) {
+  Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
+  T.linear() = ExpSo3(xi.head<3>());
+  T.translation() = LeftJacobianSo3(xi.head<3>()) * xi.tail<3>();
+  return T;
+}
+
+Vector6d LogSe3(const Eigen::Isometry3d& T) {
+  Vector6d xi;
+  xi.head<3>() = LogSo3(T.linear());
+  xi.tail<3>() = RightJacobianInverseSo3(-xi.head<3>()) * T.translation();
+  return xi;
+}
+
+Matrix6d AdjointSe3(const Eigen::Isometry3d& T) {
+  Matrix6d A = Matrix6d::Zero();
+  A.topLeftCorner<3, 3>() = T.linear();
+  A.bottomRightCorner<3, 3>() = T.linear();
+  A.bottomLeftCorner<3, 3>() = Skew(T.translation()) * T.linear();
+  return A;
+}
+
+Matrix6d RightJacobianSe3(const Vector6d& xi) {
+  const Eigen::Vector3d omega = -xi.head<3>();
+  const Eigen::Vector3d rho = -xi.tail<3>();
+  Matrix6d J = Matrix6d::Zero();
+  J.topLeftCorner<3, 3>() = LeftJacobianSo3(omega);
+  J.bottomRightCorner<3, 3>() = J.topLeftCorner<3, 3>();
+  J.bottomLeftCorner<3, 3>() = LeftQ(omega, rho);
+  return J;
+}
+
+Matrix6d RightJacobianInverseSe3(const Vector6d& xi) {
+  const Eigen::Matrix3d Ji = RightJacobianInverseSo3(xi.head<3>());
+  Matrix6d J = Matrix6d::Zero();
+  J.topLeftCorner<3, 3>() = Ji;
+  J.bottomRightCorner<3, 3>() = Ji;
+  J.bottomLeftCorner<3, 3>() = -Ji * LeftQ(-xi.head<3>(), -xi.tail<3>()) * Ji;
+  return J;
+}
+
+Eigen::Isometry3d NormalizedSe3(const Eigen::Isometry3d& T) {
+  Eigen::Isometry3d out = T;
+  out.linear() = Eigen::Quaterniond(T.linear()).normalized().toRotationMatrix();
+  return out;
+}
+
+Eigen::Isometry3d InterpolateSe3(const Eigen::Isometry3d& a,
+                                 const Eigen::Isometry3d& b,
+                                 double fraction) {
+  Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
+  const Eigen::Matrix3d R_ab = a.linear().transpose() * b.linear();
+  T.linear() = a.linear() * ExpSo3(fraction * LogSo3(R_ab));
+  T.translation() = a.translation() + fraction * (b.translation() - a.translation());
+  return T;
+}
+
+}  // namespace dendro
