@@ -1,0 +1,155 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "dendro_slam/mapping/data_association.h"
+#include "dendro_slam/mapping/mapper_io.h"
+#include "dendro_slam/mapping/tree_map.h"
+
+namespace dendro {
+
+/// Settings of Mapper.
+struct MapperConfig {
+  // Key frames: a scan becomes one when any threshold is passed.
+  double key_frame_distance_m = 0.25;   ///< Travelled since the last one [m]. > 0.
+  double key_frame_angle_deg = 8.0;     ///< Turned since the last one [deg]. > 0.
+  double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
+
+  // Odometry. The messages' own covariances do not tell the drift.
+  double vio_sigma_rad_per_m = 0.003;   ///< Rotation drift per metre travelled [rad/m]. >= 0.
+  double vio_sigma_m_per_m = 0.012;     ///< Translation drift per metre travelled. >= 0.
+  double vio_sigma_per_rad = 0.01;      ///< Rotation drift per radian turned. >= 0.
+  double vio_sigma_floor_rad = 0.0015;  ///< Per step, per axis [rad]. > 0.
+  double vio_sigma_floor_m = 0.004;     ///< Per step, per axis [m]. > 0.
+  double odometry_gate_sigma = 4.0;     ///< VIO and ICP that differ by more are not both believed. > 0.
+  double vio_max_speed_mps = 8.0;       ///< A faster VIO step is a jump, whatever ICP says [m/s]. > 0.
+  double vio_max_turn_rad_per_s = 6.0;  ///< A faster VIO turn is a jump [rad/s]. > 0.
+  double blind_sigma_m_per_s = 0.5;     ///< Motion with no odometry at all: sigma per second [m/s]. > 0.
+  double blind_sigma_rad_per_s = 0.5;   ///< The same for rotation [rad/s]. > 0.
+
+  // Observations.
+  double observation_scale = 1.5;       ///< The fits' sigmas are multiplied by this. > 0.
+  double observation_axis_floor_deg = 0.3;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
+  double observation_offset_floor_m = 0.004;  ///< Added to the line's sigma [m]. >= 0.
+  double robust_width = 2.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
+                                        ///< weight (Huber). > 0.
+  double min_radius_m = 0.008;          ///< Thinner fits are not mapped [m]. > 0.
+  double max_radius_sigma_rel = 0.5;    ///< Fits that know their radius worse are not mapped. > 0.
+
+  // Finding a loaded map again.
+  double relocalize_axis_deg = 6.0;     ///< Tolerance on the axes [deg]. > 0.
+  double relocalize_offset_m = 0.15;    ///< Tolerance on the lines [m]. > 0.
+  double relocalize_radius_ratio = 1.35;  ///< Tolerance on the radii. > 1.
+  int relocalize_min_matches = 3;       ///< Landmarks that must agree. >= 2.
+  double relocalize_tilt_deg = 10.0;    ///< With odometry both maps are upright to within this [deg]. > 0.
+  int relocalize_every_key_frames = 4;  ///< How often it is tried. >= 1.
+  int relocalize_max_scans = 3000;      ///< Scans kept until it succeeds; older ones are dropped. >= 10.
+
+  DataAssociationConfig association;
+  TreeMapConfig tree_map;
+  RadiusProfileConfig radius_profile;
+
+  /// @throws std::invalid_argument naming the field.
+  void Validate() const;
+
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("key_frame_distance_m", key_frame_distance_m);
+    v("key_frame_angle_deg", key_frame_angle_deg);
+    v("key_frame_time_s", key_frame_time_s);
+    v("vio_sigma_rad_per_m", vio_sigma_rad_per_m);
+    v("vio_sigma_m_per_m", vio_sigma_m_per_m);
+    v("vio_sigma_per_rad", vio_sigma_per_rad);
+    v("vio_sigma_floor_rad", vio_sigma_floor_rad);
+    v("vio_sigma_floor_m", vio_sigma_floor_m);
+    v("odometry_gate_sigma", odometry_gate_sigma);
+    v("vio_max_speed_mps", vio_max_speed_mps);
+    v("vio_max_turn_rad_per_s", vio_max_turn_rad_per_s);
+    v("blind_sigma_m_per_s", blind_sigma_m_per_s);
+    v("blind_sigma_rad_per_s", blind_sigma_rad_per_s);
+    v("observation_scale", observation_scale);
+    v("observation_axis_floor_deg", observation_axis_floor_deg);
+    v("observation_offset_floor_m", observation_offset_floor_m);
+    v("robust_width", robust_width);
+    v("min_radius_m", min_radius_m);
+    v("max_radius_sigma_rel", max_radius_sigma_rel);
+    v("relocalize_axis_deg", relocalize_axis_deg);
+    v("relocalize_offset_m", relocalize_offset_m);
+    v("relocalize_radius_ratio", relocalize_radius_ratio);
+    v("relocalize_min_matches", relocalize_min_matches);
+    v("relocalize_tilt_deg", relocalize_tilt_deg);
+    v("relocalize_every_key_frames", relocalize_every_key_frames);
+    v("relocalize_max_scans", relocalize_max_scans);
+    association.Visit(v);
+    tree_map.Visit(v);
+    radius_profile.Visit(v);
+  }
+};
+
+/// A pose of the trajectory.
+struct StampedPose {
+  std::int64_t stamp_ns = 0;
+  Eigen::Isometry3d T_map_lidar = Eigen::Isometry3d::Identity();
+};
+
+/// Everything needed to go on with a map in a later session. Plain data, for files.
+struct MapSnapshot {
+  int next_landmark_id = 0;
+  bool upright = false;                  ///< The map's z axis is up (odometry was there at the start).
+  std::vector<LandmarkState> landmarks;  ///< Ascending in id; candidates included.
+};
+
+/// Stage 4's facade: one synchronised scan in, one result out.
+///
+/// Owns the factor graph (key-frame poses and landmark lines), the landmarks and the trajectory.
+/// Per scan: predict the pose from the covariance-weighted mean of VIO and ICP, associate the
+/// cylinders, refine the pose on them, and at key frames add a pose node, its two between-factors
+/// and one factor per cylinder, and update the incremental solver. Scans between key frames get
+/// their pose the same way and still widen extents and radius profiles.
+///
+/// The map frame is the odometry frame at the first scan with odometry (so z is up if it is there),
+/// or the first lidar pose without odometry. Deterministic; one thread; not thread-safe.
+class Mapper {
+ public:
+  /// @throws std::invalid_argument for a bad configuration.
+  explicit Mapper(MapperConfig config = {});
+  ~Mapper();
+  Mapper(Mapper&&) noexcept;
+  Mapper& operator=(Mapper&&) noexcept;
+
+  /// Takes one scan. Stamps must ascend; a scan that is not later than the one before is refused
+  /// (MapperResult::warning says so) and changes nothing. Call Reset() when the data starts anew.
+  MapperResult AddScan(const MapperInput& input);
+
+  /// The confirmed landmarks, ascending in id, in the map frame.
+  std::vector<Landmark> Landmarks() const;
+  /// The same with the candidates.
+  std::vector<Landmark> AllLandmarks() const;
+  /// Poses of all scans with the graph's present estimate.
+  std::vector<StampedPose> Trajectory() const;
+  /// Correction of the odometry at the last scan that had odometry; identity before.
+  Eigen::Isometry3d T_map_odom() const;
+  int num_key_frames() const;
+  /// A loaded map has not been found again yet: results are in a frame of their own.
+  bool relocalizing() const;
+
+  /// State of the map, for saving.
+  MapSnapshot Snapshot() const;
+  /// Starts anew on a loaded map. The pose is unknown until the cylinders are recognised.
+  /// @throws std::invalid_argument for a snapshot that is not finite or whose ids are not ascending.
+  void Load(const MapSnapshot& snapshot);
+
+  /// Forgets everything.
+  void Reset();
+
+  const MapperConfig& config() const;
+
+ private:
+  class Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace dendro

@@ -1,0 +1,145 @@
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "dendro_slam/mapping/data_association.h"
+#include "dendro_slam/mapping/landmark.h"
+#include "dendro_slam/mapping/radius_profile.h"
+
+namespace dendro {
+
+/// Settings of TreeMap.
+struct TreeMapConfig {
+  int confirm_scans = 8;             ///< A candidate becomes map when this many scans saw it. >= 1.
+  double confirm_ratio = 0.3;        ///< And this share of the scans from its first to its last. In [0, 1].
+  double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known this well. > 0.
+  int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
+  double max_length_m = 12.0;        ///< A landmark is not extended beyond this [m]. > 0.
+  double coverage_cell_m = 0.05;     ///< Resolution of the extents [m]. > 0.
+  double end_support = 0.15;         ///< An end lies where the coverage falls below this share of
+                                     ///< the scans that cover the densest part. In (0, 1].
+  double min_gap_m = 0.15;           ///< A gap shorter than this does not split a landmark [m]. > 0.
+  double gap_support = 0.05;         ///< A gap is where fewer than this share of the scans on both of its
+                                     ///< sides saw wood. In [0, 1).
+  int gap_min_scans = 20;            ///< And both sides were covered by this many scans. >= 1.
+  double merge_gate_sigma = 3.0;     ///< Duplicates: gate on the lines' difference. > 0.
+  double merge_min_overlap = -0.1;   ///< Duplicates overlap by at least this [m]; below 0 a gap.
+
+  /// @throws std::invalid_argument naming the field.
+  void Validate() const;
+
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("confirm_scans", confirm_scans);
+    v("confirm_ratio", confirm_ratio);
+    v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
+    v("candidate_max_gap_scans", candidate_max_gap_scans);
+    v("max_length_m", max_length_m);
+    v("coverage_cell_m", coverage_cell_m);
+    v("end_support", end_support);
+    v("min_gap_m", min_gap_m);
+    v("gap_support", gap_support);
+    v("gap_min_scans", gap_min_scans);
+    v("merge_gate_sigma", merge_gate_sigma);
+    v("merge_min_overlap", merge_min_overlap);
+  }
+};
+
+/// Everything the map keeps of one landmark beside its graph variable. Plain data, for files.
+struct LandmarkState {
+  int id = 0;
+  Cylinder line;                     ///< The graph's variable: its anchor is the zero of every s.
+  Matrix5d covariance = Matrix5d::Identity();  ///< Marginal of `line`.
+  RadiusProfile profile;
+  int first_cell = 0;                ///< Index of coverage.front(); a cell k spans [k, k+1) * cell size.
+  std::vector<int> coverage;         ///< Scans that saw wood in the cell.
+  double end_sigma_m = 0.05;         ///< Ring spacing leaves this unknown of an end; mean over the scans.
+  int num_scans = 0;
+  int num_points = 0;
+  std::bitset<Landmark::kArcBins> arc_seen;
+  double deviation_sum_m = 0.0;      ///< Sum of the fits' mean absolute deviations.
+  std::int64_t first_scan = 0;       ///< Running number of the scan that started it.
+  std::int64_t last_scan = 0;        ///< Running number of the scan that saw it last.
+  bool confirmed = false;
+};
+
+/// A landmark cut in two: coverage shows two pieces with a gap.
+struct LandmarkSplit {
+  int landmark_id = 0;
+  double gap_begin_m = 0.0;          ///< Along the axis from the anchor.
+  double gap_end_m = 0.0;
+};
+
+/// Two landmarks that are one.
+struct LandmarkMerge {
+  int keep_id = 0;                   ///< The older one.
+  int drop_id = 0;
+};
+
+/// The landmarks of the map: candidates and confirmed, with extents, radius profiles and counters.
+/// Geometry of the lines is owned by the factor graph and set from outside.
+class TreeMap {
+ public:
+  /// @throws std::invalid_argument for a bad configuration.
+  TreeMap(TreeMapConfig config, RadiusProfileConfig profile_config);
+
+  /// Starts a candidate from an observation.
+  /// @return Its id.
+  int Add(const FittedCylinder& observation,
+          const Eigen::Isometry3d& T_map_lidar,
+          std::int64_t scan_number);
+
+  /// Adds an observation's extent, radius and counters to a landmark.
+  void Observe(int id,
+               const FittedCylinder& observation,
+               const Eigen::Isometry3d& T_map_lidar,
+               std::int64_t scan_number);
+
+  /// Sets the line of a landmark (the graph's estimate) and its marginal covariance.
+  void SetLine(int id, const Cylinder& line, const Matrix5d& covariance);
+
+  /// Confirms candidates that earned it; returns the ids of candidates to be dropped (not yet
+  /// removed).
+  std::vector<int> Promote(std::int64_t scan_number);
+
+  void Remove(int id);
+
+  /// The first pair of landmarks that are one, by line, extent and radius.
+  std::optional<LandmarkMerge> FindDuplicate(const DataAssociationConfig& association) const;
+
+  /// Joins a duplicate's extents, profile and counters to the one kept and removes it.
+  void Merge(const LandmarkMerge& merge);
+
+  /// The first landmark whose coverage shows a gap.
+  std::optional<LandmarkSplit> FindSplit() const;
+
+  /// Cuts a landmark; the longer-observed piece keeps the id.
+  /// @return Id of the new piece, and whether it lies beyond the gap (at larger s).
+  std::pair<int, bool> Split(const LandmarkSplit& split);
+
+  bool Has(int id) const;
+  const LandmarkState& State(int id) const;
+  /// The landmark as the rest of the program sees it, anchor at the middle of its extent.
+  Landmark Summary(int id) const;
+  const std::vector<LandmarkState>& states() const { return states_; }  ///< Ascending in id.
+  std::vector<Landmark> Landmarks(bool with_candidates) const;
+  int next_id() const { return next_id_; }
+
+  /// Replaces everything, for loading.
+  void Restore(std::vector<LandmarkState> states, int next_id);
+
+  const TreeMapConfig& config() const { return config_; }
+
+ private:
+  LandmarkState* Find(int id);
+  const LandmarkState* Find(int id) const;
+
+  TreeMapConfig config_;
+  RadiusProfileConfig profile_config_;
+  std::vector<LandmarkState> states_;
+  int next_id_ = 0;
+};
+
+}  // namespace dendro
