@@ -11,7 +11,8 @@ namespace dendro {
 /// A scan organised by ring and azimuth, with the motion of the sweep removed.
 ///
 /// Row r is ring r (row 0 the lowest beam); column c covers azimuths [c, c+1) * 360 / cols degrees,
-/// clockwise seen from above as a VLP-16 turns, azimuth 0 along +x. Pixel (r, c) is at index
+/// clockwise seen from above as a VLP-16 turns, azimuth 0 along +x. A column is one firing of all
+/// rings, placed by the azimuth at which it starts (see Projector). Pixel (r, c) is at index
 /// `r * cols + c` of every vector. All geometry is in the lidar frame at `stamp_ns`.
 ///
 /// A pixel without a return has NaN `point` and `range`, `point_index` -1, but still a valid beam
