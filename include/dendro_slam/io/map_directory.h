@@ -13,7 +13,9 @@
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/io/stage_timer.h"
 #include "dendro_slam/mapping/landmark.h"
+#include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/mapping/tree_model.h"
+#include "dendro_slam/odometry/relative_motion.h"
 #include "dendro_slam/range_image/range_image.h"
 #include "dendro_slam/topology/tree_topology.h"
 
@@ -25,15 +27,12 @@ class MapFileError : public std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-struct StampedPose {
-  std::int64_t stamp_ns = 0;
-  Eigen::Isometry3d T_map_lidar = Eigen::Isometry3d::Identity();
-};
-
 /// Everything a map directory holds.
 struct MapFiles {
   TreeModel model;
-  std::vector<Landmark> landmarks;      ///< Candidates too, so that a loaded map goes on.
+  std::vector<Landmark> landmarks;      ///< As people read them; candidates too.
+  MapSnapshot snapshot;                 ///< What Mapper::Load needs so that a loaded map goes on:
+                                        ///< tree_map.json holds it complete (every LandmarkState).
   int next_landmark_id = 0;
   TopologyState topology;
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.

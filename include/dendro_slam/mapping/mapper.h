@@ -8,6 +8,7 @@
 #include "dendro_slam/mapping/data_association.h"
 #include "dendro_slam/mapping/mapper_io.h"
 #include "dendro_slam/mapping/tree_map.h"
+#include "dendro_slam/odometry/relative_motion.h"
 
 namespace dendro {
 
@@ -87,12 +88,6 @@ struct MapperConfig {
     tree_map.Visit(v);
     radius_profile.Visit(v);
   }
-};
-
-/// A pose of the trajectory.
-struct StampedPose {
-  std::int64_t stamp_ns = 0;
-  Eigen::Isometry3d T_map_lidar = Eigen::Isometry3d::Identity();
 };
 
 /// Everything needed to go on with a map in a later session. Plain data, for files.

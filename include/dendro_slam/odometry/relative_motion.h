@@ -6,6 +6,12 @@
 
 namespace dendro {
 
+/// A pose of the trajectory.
+struct StampedPose {
+  std::int64_t stamp_ns = 0;
+  Eigen::Isometry3d T_map_lidar = Eigen::Isometry3d::Identity();
+};
+
 /// Motion of the lidar between two stamps, with its uncertainty.
 struct RelativeMotion {
   std::int64_t from_stamp_ns = 0;
