@@ -1,0 +1,320 @@
+#include "dendro_slam/segmentation/erfnet.h"
+
+#include <algorithm>
+#include <cstring>
+#include <set>
+#include <sstream>
+#include <stdexcept>
+
+#include <fmt/format.h>
+#include <opencv2/dnn.hpp>
+
+namespace dendro {
+namespace {
+
+constexpr std::size_t kMaxLayers = 128;
+constexpr int kMaxChannels = 1024;
+constexpr int kMaxDilation = 64;
+
+std::vector<std::string> Split(const std::string& text, char separator) {
+  std::vector<std::string> parts;
+  std::string part;
+  std::istringstream stream(text);
+  while (std::getline(stream, part, separator)) parts.push_back(part);
+  return parts;
+}
+
+// A decimal number of one to four digits, or -1.
+int ToInt(const std::string& text) {
+  if (text.empty() || text.size() > 4) return -1;
+  int value = 0;
+  for (const char c : text) {
+    if (c < '0' || c > '9') return -1;
+    value = 10 * value + (c - '0');
+  }
+  return value;
+}
+
+// Adds layers to a cv::dnn::Net one by one and keeps track of which tensors were used.
+class Builder {
+ public:
+  Builder(const TensorFile& weights, cv::dnn::Net* net) : weights_(weights), net_(net) {}
+
+  int Add(const std::string& name,
+          const std::string& type,
+          cv::dnn::LayerParams params,
+          const std::vector<int>& inputs) {
+    params.name = name;
+    params.type = type;
+    const int id = net_->addLayer(name, type, params);
+    for (std::size_t i = 0; i < inputs.size(); ++i) {
+      net_->connect(inputs[i], 0, id, static_cast<int>(i));
+    }
+    return id;
+  }
+
+  int Relu(const std::string& name, int input) { return Add(name, "ReLU", {}, {input}); }
+
+  struct Window {
+    int kernel_h = 1, kernel_w = 1, stride_h = 1, stride_w = 1, pad_h = 0, pad_w = 0;
+    int dilation_h = 1, dilation_w = 1;
+  };
+
+  static void SetWindow(const Window& window, cv::dnn::LayerParams* params) {
+    params->set("kernel_h", window.kernel_h);
+    params->set("kernel_w", window.kernel_w);
+    params->set("stride_h", window.stride_h);
+    params->set("stride_w", window.stride_w);
+    params->set("pad_h", window.pad_h);
+    params->set("pad_w", window.pad_w);
+    params->set("dilation_h", window.dilation_h);
+    params->set("dilation_w", window.dilation_w);
+  }
+
+  int Convolution(const std::string& name, int input, int in, int out, const Window& window) {
+    cv::dnn::LayerParams params;
+    SetWindow(window, &params);
+    params.set("num_output", out);
+    params.set("bias_term", true);
+    params.blobs.push_back(Blob(name + ".weight", {out, in, window.kernel_h, window.kernel_w}));
+    params.blobs.push_back(Blob(name + ".bias", {out}));
+    return Add(name, "Convolution", params, {input});
+  }
+
+  int Deconvolution(const std::string& name, int input, int in, int out, Window window) {
+    // So much padding that the output is exactly stride times the input.
+    window.pad_h = (window.kernel_h - window.stride_h + 1) / 2;
+    window.pad_w = (window.kernel_w - window.stride_w + 1) / 2;
+    cv::dnn::LayerParams params;
+    SetWindow(window, &params);
+    params.set("adj_h", window.stride_h - window.kernel_h + 2 * window.pad_h);
+    params.set("adj_w", window.stride_w - window.kernel_w + 2 * window.pad_w);
+    params.set("num_output", out);
+    params.set("bias_term", true);
+    params.blobs.push_back(Blob(name + ".weight", {in, out, window.kernel_h, window.kernel_w}));
+    params.blobs.push_back(Blob(name + ".bias", {out}));
+    return Add(name, "Deconvolution", params, {input});
+  }
+
+  int Pool(const std::string& name, int input, int channels, int stride_h, int stride_w) {
+    cv::dnn::LayerParams params;
+    Window window;
+    window.kernel_h = window.stride_h = stride_h;
+    window.kernel_w = window.stride_w = stride_w;
+    SetWindow(window, &params);
+    params.set("pool", "max");
+    params.set("ceil_mode", false);
+    const int pooled = Add(name + ".max", "Pooling", params, {input});
+    // The batch normalisation behind a pooling has no convolution to fold into.
+    cv::dnn::LayerParams scale;
+    scale.set("axis", 1);
+    scale.set("bias_term", true);
+    scale.blobs.push_back(Blob(name + ".weight", {channels}));
+    scale.blobs.push_back(Blob(name + ".bias", {channels}));
+    return Add(name, "Scale", scale, {pooled});
+  }
+
+  bool AllUsed() const { return used_.size() == weights_.tensors().size(); }
+
+ private:
+  cv::Mat Blob(const std::string& name, const std::vector<int>& shape) {
+    const Tensor& tensor = weights_.Get(name, shape);
+    used_.insert(name);
+    // OpenCV keeps a reference to the data of a blob, so it gets a copy of its own.
+    std::vector<int> sizes = shape;
+    if (sizes.size() == 1) sizes.insert(sizes.begin(), 1);
+    cv::Mat blob(sizes, CV_32F);
+    std::memcpy(blob.ptr<float>(), tensor.values.data(), tensor.values.size() * sizeof(float));
+    return blob;
+  }
+
+  const TensorFile& weights_;
+  cv::dnn::Net* net_;
+  std::set<std::string> used_;
+};
+
+}  // namespace
+
+std::vector<ErfNetLayer> ParseErfNetLayers(const std::string& text, const std::string& file_name) {
+  std::vector<ErfNetLayer> layers;
+  std::istringstream stream(text);
+  std::string word;
+  while (stream >> word) {
+    const auto fail = [&](const char* reason) {
+      throw WeightsError(fmt::format("weights file '{}': layer {} '{}' {}", file_name,
+                                     layers.size(), word.substr(0, 40), reason));
+    };
+    if (layers.size() >= kMaxLayers) fail("is one too many");
+    const std::vector<std::string> fields = Split(word, ':');
+    ErfNetLayer layer;
+    layer.type = fields[0];
+    const auto pair = [&](std::size_t field, int* h, int* w, int limit) {
+      const std::vector<std::string> parts = Split(fields[field], 'x');
+      if (parts.size() != 2) fail("needs a pair like 1x2");
+      *h = ToInt(parts[0]);
+      *w = ToInt(parts[1]);
+      if (*h < 1 || *w < 1 || *h > limit || *w > limit) fail("has a number out of range");
+    };
+    const auto want = [&](std::size_t count) {
+      if (fields.size() != count) fail("has a wrong number of fields");
+    };
+    const auto channels = [&]() {
+      layer.channels = ToInt(fields[1]);
+      if (layer.channels < 1 || layer.channels > kMaxChannels) fail("has a bad channel count");
+    };
+    if (layer.type == "stem" || layer.type == "out") {
+      want(4);
+      channels();
+      pair(2, &layer.kernel_h, &layer.kernel_w, 9);
+      pair(3, &layer.stride_h, &layer.stride_w, 2);
+      if (layer.type == "stem" && (layer.kernel_h % 2 == 0 || layer.kernel_w % 2 == 0)) {
+        fail("needs an odd kernel");
+      }
+      if (layer.kernel_h < layer.stride_h || layer.kernel_w < layer.stride_w) {
+        fail("has a kernel smaller than its stride");
+      }
+    } else if (layer.type == "down" || layer.type == "up") {
+      want(3);
+      channels();
+      pair(2, &layer.stride_h, &layer.stride_w, 2);
+    } else if (layer.type == "nb") {
+      want(2);
+      pair(1, &layer.dilation_h, &layer.dilation_w, kMaxDilation);
+    } else if (layer.type == "push" || layer.type == "add") {
+      want(1);
+    } else {
+      fail("is of an unknown type");
+    }
+    layers.push_back(layer);
+  }
+  return layers;
+}
+
+struct ErfNet::Impl {
+  cv::dnn::Net net;
+};
+
+ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
+  const auto fail = [&](const std::string& reason) {
+    throw WeightsError(fmt::format("weights file '{}': {}", weights.name(), reason));
+  };
+  if (weights.Metadata("format") != "dendro_erfnet_1") {
+    fail("is not of format dendro_erfnet_1: another architecture");
+  }
+  input_channels_ = ToInt(weights.Metadata("input_channels"));
+  if (input_channels_ < 1 || input_channels_ > 64) fail("has a bad input_channels");
+  const std::vector<ErfNetLayer> layers =
+      ParseErfNetLayers(weights.Metadata("layers"), weights.name());
+  if (layers.empty() || layers.back().type != "out") fail("does not end in an 'out' layer");
+
+  struct Shape {
+    int id, channels, scale_h, scale_w;  // Scale: how many input pixels one pixel stands for.
+  };
+  Builder builder(weights, &impl_->net);
+  Shape at{0, input_channels_, 1, 1};
+  std::vector<Shape> kept;
+  for (std::size_t i = 0; i < layers.size(); ++i) {
+    const ErfNetLayer& layer = layers[i];
+    const std::string name = fmt::format("{:02d}", i);
+    Builder::Window window;
+    window.kernel_h = layer.kernel_h;
+    window.kernel_w = layer.kernel_w;
+    window.stride_h = layer.stride_h;
+    window.stride_w = layer.stride_w;
+    window.pad_h = layer.kernel_h / 2;
+    window.pad_w = layer.kernel_w / 2;
+    if (layer.type == "stem") {
+      const int conv =
+          builder.Convolution(name + ".conv", at.id, at.channels, layer.channels, window);
+      at = {builder.Relu(name + ".relu", conv), layer.channels, at.scale_h * layer.stride_h,
+            at.scale_w * layer.stride_w};
+    } else if (layer.type == "down") {
+      if (layer.channels <= at.channels) fail(fmt::format("layer {} must add channels", i));
+      const int added = layer.channels - at.channels;
+      const int conv = builder.Convolution(name + ".conv", at.id, at.channels, added, window);
+      const int pool =
+          builder.Pool(name + ".pool", at.id, at.channels, layer.stride_h, layer.stride_w);
+      cv::dnn::LayerParams concat;
+      concat.set("axis", 1);
+      const int joined = builder.Add(name + ".concat", "Concat", concat, {conv, pool});
+      at = {builder.Relu(name + ".relu", joined), layer.channels, at.scale_h * layer.stride_h,
+            at.scale_w * layer.stride_w};
+    } else if (layer.type == "nb") {
+      const auto column = [](int dilation) {
+        Builder::Window w;
+        w.kernel_h = 3;
+        w.dilation_h = w.pad_h = dilation;
+        return w;
+      };
+      const auto row = [](int dilation) {
+        Builder::Window w;
+        w.kernel_w = 3;
+        w.dilation_w = w.pad_w = dilation;
+        return w;
+      };
+      const int c = at.channels;
+      int id = builder.Convolution(name + ".conv1", at.id, c, c, column(1));
+      id = builder.Relu(name + ".relu1", id);
+      id = builder.Convolution(name + ".conv2", id, c, c, row(1));
+      id = builder.Relu(name + ".relu2", id);
+      id = builder.Convolution(name + ".conv3", id, c, c, column(layer.dilation_h));
+      id = builder.Relu(name + ".relu3", id);
+      id = builder.Convolution(name + ".conv4", id, c, c, row(layer.dilation_w));
+      cv::dnn::LayerParams sum;
+      sum.set("operation", "sum");
+      id = builder.Add(name + ".sum", "Eltwise", sum, {id, at.id});
+      at.id = builder.Relu(name + ".relu", id);
+    } else if (layer.type == "push") {
+      kept.push_back(at);
+    } else if (layer.type == "add") {
+      if (kept.empty() || kept.back().channels != at.channels ||
+          kept.back().scale_h != at.scale_h || kept.back().scale_w != at.scale_w) {
+        fail(fmt::format("layer {} adds a feature map of another size", i));
+      }
+      cv::dnn::LayerParams sum;
+      sum.set("operation", "sum");
+      at.id = builder.Add(name + ".add", "Eltwise", sum, {at.id, kept.back().id});
+      kept.pop_back();
+    } else {  // up, out
+      if (at.scale_h % layer.stride_h != 0 || at.scale_w % layer.stride_w != 0) {
+        fail(fmt::format("layer {} enlarges past the input", i));
+      }
+      int id = builder.Deconvolution(name + ".conv", at.id, at.channels, layer.channels, window);
+      if (layer.type == "up") id = builder.Relu(name + ".relu", id);
+      at = {id, layer.channels, at.scale_h / layer.stride_h, at.scale_w / layer.stride_w};
+    }
+    row_multiple_ = std::max(row_multiple_, at.scale_h);
+    col_multiple_ = std::max(col_multiple_, at.scale_w);
+  }
+  if (at.scale_h != 1 || at.scale_w != 1) fail("does not return to the size of the input");
+  if (!builder.AllUsed()) fail("holds tensors that its layers do not use: another architecture");
+  classes_ = at.channels;
+  impl_->net.setPreferableBackend(cv::dnn::DNN_BACKEND_OPENCV);
+  impl_->net.setPreferableTarget(cv::dnn::DNN_TARGET_CPU);
+}
+
+ErfNet::~ErfNet() = default;
+ErfNet::ErfNet(ErfNet&&) noexcept = default;
+ErfNet& ErfNet::operator=(ErfNet&&) noexcept = default;
+
+std::vector<float> ErfNet::Forward(const std::vector<float>& planes, int rows, int cols) {
+  if (rows < 1 || cols < 1 || rows % row_multiple_ != 0 || cols % col_multiple_ != 0) {
+    throw std::invalid_argument(fmt::format("rows x cols {} x {} must be multiples of {} and {}",
+                                            rows, cols, row_multiple_, col_multiple_));
+  }
+  const std::size_t pixels = static_cast<std::size_t>(rows) * static_cast<std::size_t>(cols);
+  if (planes.size() != pixels * static_cast<std::size_t>(input_channels_)) {
+    throw std::invalid_argument("planes has the wrong size");
+  }
+  // The net only reads its input; Mat has no constructor for constant data.
+  const cv::Mat input(std::vector<int>{1, input_channels_, rows, cols},
+                      CV_32F,
+                      const_cast<float*>(planes.data()));
+  impl_->net.setInput(input);
+  const cv::Mat output = impl_->net.forward();
+  // forward() returns memory that the next call overwrites: copy.
+  const float* values = output.ptr<float>();
+  return std::vector<float>(values, values + pixels * static_cast<std::size_t>(classes_));
+}
+
+}  // namespace dendro

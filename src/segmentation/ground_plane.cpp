@@ -1,0 +1,164 @@
+#include "dendro_slam/segmentation/ground_plane.h"
+
+#include <algorithm>
+#include <cmath>
+#include <random>
+#include <stdexcept>
+#include <vector>
+
+#include <Eigen/Dense>
+
+namespace dendro {
+namespace {
+
+constexpr std::size_t kMaxSamples = 3000;
+constexpr float kBelowFactor = 3.0F;  // A return this many half thicknesses under is "below".
+// The axis of a lidar is more often near the vertical than not; of two planes that explain the scan
+// about equally well (ground and wall), this prefers the one across the axis.
+constexpr float kUprightBonus = 0.5F;
+
+struct Score {
+  float inliers = 0.0F;
+  float below = 0.0F;
+};
+
+Score Evaluate(const GroundPlane& plane,
+               const std::vector<Eigen::Vector3f>& points,
+               const std::vector<float>& weights,
+               float distance) {
+  Score score;
+  for (std::size_t i = 0; i < points.size(); ++i) {
+    const float height = plane.Height(points[i]);
+    if (std::abs(height) <= distance) {
+      score.inliers += weights[i];
+    } else if (height < -kBelowFactor * distance) {
+      score.below += weights[i];
+    }
+  }
+  return score;
+}
+
+}  // namespace
+
+void GroundPlaneConfig::Validate() const {
+  if (hypotheses < 1) throw std::invalid_argument("hypotheses must be >= 1");
+  if (!(inlier_distance_m > 0.0)) throw std::invalid_argument("inlier_distance_m must be > 0");
+  if (!(max_range_m > 0.0)) throw std::invalid_argument("max_range_m must be > 0");
+  if (!(min_inlier_ratio > 0.0 && min_inlier_ratio < 1.0)) {
+    throw std::invalid_argument("min_inlier_ratio must be in (0, 1)");
+  }
+  if (!(max_below_ratio >= 0.0 && max_below_ratio < 1.0)) {
+    throw std::invalid_argument("max_below_ratio must be in [0, 1)");
+  }
+}
+
+std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
+                                               const GroundPlaneConfig& config) {
+  std::vector<std::size_t> pixels;
+  pixels.reserve(image.size());
+  const float max_range = static_cast<float>(config.max_range_m);
+  for (std::size_t i = 0; i < image.size(); ++i) {
+    if (image.HasReturn(i) && image.range[i] <= max_range && image.point[i].allFinite()) {
+      pixels.push_back(i);
+    }
+  }
+  if (pixels.size() < 30) return std::nullopt;
+
+  // Every k-th return, with k odd so that no row is systematically favoured.
+  std::size_t step = pixels.size() / kMaxSamples + 1;
+  if (step % 2 == 0) ++step;
+  std::vector<Eigen::Vector3f> points;
+  std::vector<float> weights;
+  float total = 0.0F;
+  for (std::size_t i = 0; i < pixels.size(); i += step) {
+    points.push_back(image.point[pixels[i]]);
+    weights.push_back(image.range[pixels[i]]);
+    total += weights.back();
+  }
+  const float distance = static_cast<float>(config.inlier_distance_m);
+
+  std::mt19937 rng(20240531U);
+  const auto draw = [&rng](std::size_t n) { return static_cast<std::size_t>(rng()) % n; };
+  const auto nearby = [&](std::size_t pixel) -> std::optional<std::size_t> {
+    const int row = static_cast<int>(pixel) / image.cols;
+    const int col = static_cast<int>(pixel) % image.cols;
+    const int reach = std::max(2, image.cols / 6);
+    for (int attempt = 0; attempt < 4; ++attempt) {
+      const int r = row + static_cast<int>(draw(7)) - 3;
+      const int c = col + static_cast<int>(draw(static_cast<std::size_t>(2 * reach))) - reach;
+      if (r < 0 || r >= image.rows) continue;
+      const std::size_t other = image.Index(r, image.WrapColumn(c));
+      if (other != pixel && image.HasReturn(other) && image.range[other] <= max_range) return other;
+    }
+    return std::nullopt;
+  };
+
+  std::optional<GroundPlane> best;
+  float best_score = 0.0F;
+  for (int h = 0; h < config.hypotheses; ++h) {
+    const std::size_t first = pixels[draw(pixels.size())];
+    std::size_t second = pixels[draw(pixels.size())];
+    std::size_t third = pixels[draw(pixels.size())];
+    if (h % 4 != 0) {  // Most triples from one neighbourhood: likelier to be on one surface.
+      const auto a = nearby(first);
+      const auto b = nearby(first);
+      if (!a || !b) continue;
+      second = *a;
+      third = *b;
+    }
+    const Eigen::Vector3f edge_a = image.point[second] - image.point[first];
+    const Eigen::Vector3f edge_b = image.point[third] - image.point[first];
+    const Eigen::Vector3f cross = edge_a.cross(edge_b);
+    const float area = cross.norm();
+    if (!(area > 0.05F) || !(area > 0.05F * edge_a.norm() * edge_b.norm())) continue;
+    GroundPlane plane;
+    plane.normal = cross / area;
+    plane.offset = -plane.normal.dot(image.point[first]);
+    if (plane.offset < 0.0F) {  // The sensor is above the ground.
+      plane.normal = -plane.normal;
+      plane.offset = -plane.offset;
+    }
+    if (plane.offset < 0.1F) continue;
+    const Score score = Evaluate(plane, points, weights, distance);
+    if (score.below > static_cast<float>(config.max_below_ratio) * total) continue;
+    const float value = (score.inliers - 2.0F * score.below) *
+                        (1.0F + kUprightBonus * std::abs(plane.normal.z()));
+    if (value > best_score) {
+      best_score = value;
+      best = plane;
+    }
+  }
+  if (!best) return std::nullopt;
+
+  for (int iteration = 0; iteration < 3; ++iteration) {
+    Eigen::Vector3d mean = Eigen::Vector3d::Zero();
+    Eigen::Matrix3d second_moment = Eigen::Matrix3d::Zero();
+    double n = 0.0;
+    for (const Eigen::Vector3f& p : points) {
+      if (std::abs(best->Height(p)) > distance) continue;
+      const Eigen::Vector3d q = p.cast<double>();
+      mean += q;
+      second_moment += q * q.transpose();
+      n += 1.0;
+    }
+    if (n < 10.0) return std::nullopt;
+    mean /= n;
+    const Eigen::Matrix3d covariance = second_moment / n - mean * mean.transpose();
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(covariance);
+    Eigen::Vector3d normal = solver.eigenvectors().col(0);
+    // Returns along one line do not make a plane.
+    if (solver.eigenvalues()(1) < 0.05) return std::nullopt;
+    if (normal.dot(best->normal.cast<double>()) < 0.0) normal = -normal;
+    best->normal = normal.cast<float>();
+    best->offset = static_cast<float>(-normal.dot(mean));
+  }
+  const Score score = Evaluate(*best, points, weights, distance);
+  if (best->offset < 0.1F ||
+      score.inliers < static_cast<float>(config.min_inlier_ratio) * total ||
+      score.below > static_cast<float>(config.max_below_ratio) * total) {
+    return std::nullopt;
+  }
+  return best;
+}
+
+}  // namespace dendro
