@@ -47,6 +47,9 @@ void GroundPlaneConfig::Validate() const {
   if (!(min_inlier_ratio > 0.0 && min_inlier_ratio < 1.0)) {
     throw std::invalid_argument("min_inlier_ratio must be in (0, 1)");
   }
+  if (!(min_column_ratio >= 0.0 && min_column_ratio < 1.0)) {
+    throw std::invalid_argument("min_column_ratio must be in [0, 1)");
+  }
   if (!(max_below_ratio >= 0.0 && max_below_ratio < 1.0)) {
     throw std::invalid_argument("max_below_ratio must be in [0, 1)");
   }
@@ -152,6 +155,16 @@ std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
     best->normal = normal.cast<float>();
     best->offset = static_cast<float>(-normal.dot(mean));
   }
+  // A plane laid through a few stems meets only their columns; the ground is seen all around.
+  std::vector<char> seen(static_cast<std::size_t>(image.cols), 0);
+  for (const std::size_t pixel : pixels) {
+    if (std::abs(best->Height(image.point[pixel])) <= distance) {
+      seen[pixel % static_cast<std::size_t>(image.cols)] = 1;
+    }
+  }
+  const auto columns = std::count(seen.begin(), seen.end(), 1);
+  if (static_cast<double>(columns) < config.min_column_ratio * image.cols) return std::nullopt;
+
   const Score score = Evaluate(*best, points, weights, distance);
   if (best->offset < 0.1F ||
       score.inliers < static_cast<float>(config.min_inlier_ratio) * total ||

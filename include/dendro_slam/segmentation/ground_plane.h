@@ -22,6 +22,7 @@ struct GroundPlaneConfig {
   double inlier_distance_m = 0.12;  ///< Half thickness of the plane [m]. > 0.
   double max_range_m = 25.0;       ///< Returns considered [m]. > 0.
   double min_inlier_ratio = 0.08;  ///< Of the returns considered. In (0, 1).
+  double min_column_ratio = 0.1;    ///< Of the columns, with the plane in sight. In [0, 1).
   double max_below_ratio = 0.04;   ///< Returns that may lie under the plane. In [0, 1).
 
   void Validate() const;
@@ -31,6 +32,7 @@ struct GroundPlaneConfig {
     v("inlier_distance_m", inlier_distance_m);
     v("max_range_m", max_range_m);
     v("min_inlier_ratio", min_inlier_ratio);
+    v("min_column_ratio", min_column_ratio);
     v("max_below_ratio", max_below_ratio);
   }
 };
