@@ -100,40 +100,42 @@ class Projector {
 
  private:
   struct PointWork {
-    double azimuth_deg;  ///< Of the firing (vlp16) or the return itself (uniform).
-    float range;
-    std::int16_t row;  ///< -1: not projected.
-    std::int32_t firing;
+    double azimuth_deg;   ///< Of the return itself, then of its firing's start (vlp16).
+    float range;          ///< From the beam's origin [m].
+    std::int32_t row;     ///< -1: not projected.
+    std::int32_t firing;  ///< Index into firings_.
   };
   struct Firing {
-    double azimuth_sum;
-    double time_s;
-    std::int32_t count;
-    std::int32_t col;
+    double azimuth_deg;  ///< Unwrapped, ascending [deg].
+    double time_s;       ///< Start [s].
+    std::int32_t count;  ///< Returns.
+    std::int32_t col;    ///< Unwrapped column.
   };
   struct Column {
-    double azimuth_deg;     ///< Of the firing at laser 0, or of the column's centre.
-    double time_s;          ///< Start of that firing.
-    std::int32_t firing;    ///< Firing nearest to the column's centre, -1: none with a return.
-    std::int32_t fill_from; ///< Column that this one repeats, or -1.
+    double azimuth_deg;      ///< Of the head when laser 0 fires.
+    double time_s;           ///< Of that moment [s].
+    std::int32_t fill_from;  ///< Column that this one repeats, or -1.
   };
 
   double BeamOriginZ(int row) const;
   double RowTimeS(int row) const;
   int RowOf(const LidarPoint& point, bool has_ring) const;
+  void MeasurePoints(const LidarScan& scan);
   void EstimateSpeed(const LidarScan& scan);
   void DeriveTimes(const LidarScan& scan);
   void GroupFirings();
+  void GroupColumns();
   void PlaceFirings();
   void CompleteColumns();
+  void FillImage(const LidarScan& scan, const SweepMotion* motion, RangeImage& out);
 
   ProjectorConfig config_;
   bool vlp16_;
   ProjectionReport report_;
   double rate_deg_per_s_ = 0.0;
-  double pitch_deg_ = 0.0;
+  double pitch_deg_ = 0.0;  ///< Between firings; between columns in the uniform model.
   std::vector<PointWork> work_;
-  std::vector<float> time_s_;
+  std::vector<double> time_s_;
   std::vector<std::int32_t> bins_;
   std::vector<Firing> firings_;
   std::vector<Column> columns_;

@@ -75,11 +75,11 @@ std::optional<SweepMotion> MakeSweepMotion(const PoseBuffer& poses,
                                            double end_s,
                                            double step_s = 1e-3);
 
-/// The same over the scan's own time span; for a scan without times over
-/// [0, `untimed_duration_s`], as Projector derives them.
+/// The same over the scan's own time span; for a scan without times over `untimed_span_s`, which
+/// should be the span that Projector derives for it.
 std::optional<SweepMotion> MakeSweepMotion(const PoseBuffer& poses,
                                            const Eigen::Isometry3d& T_base_lidar,
                                            const LidarScan& scan,
-                                           double untimed_duration_s = 0.1);
+                                           std::pair<double, double> untimed_span_s = {0.0, 0.1});
 
 }  // namespace dendro
