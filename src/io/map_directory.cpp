@@ -1,0 +1,917 @@
+#include "dendro_slam/io/map_directory.h"
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cmath>
+#include <cstring>
+#include <filesystem>
+#include <optional>
+#include <set>
+#include <sstream>
+#include <utility>
+
+#include <fmt/format.h>
+#include <nlohmann/json.hpp>
+
+#include "dendro_slam/io/mesh.h"
+
+namespace dendro {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+constexpr char kFormatName[] = "dendro_slam tree map";
+constexpr int kFormatVersion = 1;
+constexpr double kDegPerRad = 180.0 / M_PI;
+
+// -------------------------------------------------------------------------------------------
+// Text
+// -------------------------------------------------------------------------------------------
+
+// Fixed decimals without a negative zero, so that equal maps are equal bytes.
+std::string Num(double value, int decimals = 6) {
+  std::string text = fmt::format("{:.{}f}", value, decimals);
+  if (text[0] == '-' && text.find_first_not_of("-0.") == std::string::npos) text.erase(0, 1);
+  return text;
+}
+
+std::string Optional(int id) { return id < 0 ? std::string() : std::to_string(id); }
+
+std::string Vec(const Eigen::Vector3d& v) {
+  return Num(v.x()) + ',' + Num(v.y()) + ',' + Num(v.z());
+}
+
+// Seconds with nanoseconds, exact.
+std::string Stamp(std::int64_t ns) {
+  const std::uint64_t magnitude =
+      ns < 0 ? 0 - static_cast<std::uint64_t>(ns) : static_cast<std::uint64_t>(ns);
+  return fmt::format("{}{}.{:09d}", ns < 0 ? "-" : "", magnitude / 1000000000, magnitude % 1000000000);
+}
+
+// -------------------------------------------------------------------------------------------
+// Files
+// -------------------------------------------------------------------------------------------
+
+[[noreturn]] void FailWrite(const std::string& path, int error) {
+  throw MapFileError(fmt::format("cannot write {}: {}", path, std::strerror(error)));
+}
+
+void WriteSynced(const std::string& path, const std::string& content) {
+  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
+  if (fd < 0) FailWrite(path, errno);
+  std::size_t done = 0;
+  int error = 0;
+  while (done < content.size() && error == 0) {
+    const ssize_t written = ::write(fd, content.data() + done, content.size() - done);
+    if (written > 0) {
+      done += static_cast<std::size_t>(written);
+    } else if (written == 0) {
+      error = ENOSPC;
+    } else if (errno != EINTR) {
+      error = errno;
+    }
+  }
+  if (error == 0 && ::fsync(fd) != 0 && errno != EINVAL) error = errno;
+  if (::close(fd) != 0 && error == 0) error = errno;
+  if (error != 0) {
+    ::unlink(path.c_str());
+    FailWrite(path, error);
+  }
+}
+
+void SyncDirectory(const std::string& directory) {
+  const int fd = ::open(directory.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+  if (fd < 0) return;
+  ::fsync(fd);
+  ::close(fd);
+}
+
+std::string TemporaryName(const std::string& path) {
+  return fmt::format("{}.tmp{}", path, ::getpid());
+}
+
+void MakeDirectory(const std::string& directory) {
+  std::error_code error;
+  std::filesystem::create_directories(directory, error);
+  if (error) {
+    throw MapFileError(fmt::format("cannot make directory {}: {}", directory, error.message()));
+  }
+  if (!std::filesystem::is_directory(directory)) {
+    throw MapFileError(fmt::format("cannot write {}: not a directory", directory));
+  }
+}
+
+// -------------------------------------------------------------------------------------------
+// JSON, writing
+// -------------------------------------------------------------------------------------------
+
+double Finite(double value, const char* what, int id) {
+  if (!std::isfinite(value)) {
+    throw MapFileError(fmt::format("the map is not saved: {} of {} is not finite", what, id));
+  }
+  return value;
+}
+
+Json VecJson(const Eigen::Vector3d& v, const char* what, int id) {
+  return {Finite(v.x(), what, id), Finite(v.y(), what, id), Finite(v.z(), what, id)};
+}
+
+Json LandmarkJson(const Landmark& landmark) {
+  const auto finite = [&](double v, const char* what) { return Finite(v, what, landmark.id); };
+  Json j;
+  j["id"] = landmark.id;
+  j["confirmed"] = landmark.confirmed;
+  j["axis"] = VecJson(landmark.cylinder.axis, "the axis of landmark", landmark.id);
+  j["point"] = VecJson(landmark.cylinder.point, "the point of landmark", landmark.id);
+  j["curvature"] = finite(landmark.cylinder.curvature, "the curvature of landmark");
+  Json covariance = Json::array();
+  for (int r = 0; r < 5; ++r) {
+    for (int c = r; c < 5; ++c) {
+      covariance.push_back(finite(landmark.covariance(r, c), "the covariance of landmark"));
+    }
+  }
+  j["covariance_upper"] = std::move(covariance);
+  j["s_min_m"] = finite(landmark.s_min_m, "s_min_m of landmark");
+  j["s_max_m"] = finite(landmark.s_max_m, "s_max_m of landmark");
+  j["s_min_sigma_m"] = finite(landmark.s_min_sigma_m, "s_min_sigma_m of landmark");
+  j["s_max_sigma_m"] = finite(landmark.s_max_sigma_m, "s_max_sigma_m of landmark");
+  j["profile"] = Json::array();
+  for (const RadiusKnot& knot : landmark.profile) {
+    j["profile"].push_back({{"s_m", finite(knot.s_m, "the profile of landmark")},
+                            {"radius_m", finite(knot.radius_m, "the profile of landmark")},
+                            {"radius_sigma_m", finite(knot.radius_sigma_m, "the profile of landmark")},
+                            {"num_scans", knot.num_scans}});
+  }
+  j["num_scans"] = landmark.num_scans;
+  j["num_points"] = landmark.num_points;
+  j["arc_seen"] = landmark.arc_seen.to_string();
+  j["mean_abs_deviation_m"] =
+      finite(landmark.mean_abs_deviation_m, "mean_abs_deviation_m of landmark");
+  return j;
+}
+
+Json CylinderJson(const MapCylinder& c) {
+  const auto finite = [&](double v) { return Finite(v, "a number of cylinder", c.id); };
+  return {{"id", c.id},
+          {"landmark_id", c.landmark_id},
+          {"tree_id", c.tree_id},
+          {"branch_id", c.branch_id},
+          {"parent_id", c.parent_id},
+          {"branch_order", c.branch_order},
+          {"position_in_branch", c.position_in_branch},
+          {"start", VecJson(c.start, "the start of cylinder", c.id)},
+          {"end", VecJson(c.end, "the end of cylinder", c.id)},
+          {"radius_m", finite(c.radius_m)},
+          {"radius_sigma_m", finite(c.radius_sigma_m)},
+          {"taper_m_per_m", finite(c.taper_m_per_m)},
+          {"axis_sigma_rad", finite(c.axis_sigma_rad)},
+          {"position_sigma_m", finite(c.position_sigma_m)},
+          {"num_scans", c.num_scans},
+          {"num_points", c.num_points},
+          {"visible_arc_rad", finite(c.visible_arc_rad)},
+          {"mean_abs_deviation_m", finite(c.mean_abs_deviation_m)},
+          {"status", ToString(c.status)}};
+}
+
+Json BranchJson(const MapBranch& b) {
+  const auto finite = [&](double v) { return Finite(v, "a number of branch", b.id); };
+  return {{"id", b.id},
+          {"tree_id", b.tree_id},
+          {"parent_id", b.parent_id},
+          {"order", b.order},
+          {"cylinder_ids", b.cylinder_ids},
+          {"base", VecJson(b.base, "the base of branch", b.id)},
+          {"tip", VecJson(b.tip, "the tip of branch", b.id)},
+          {"length_m", finite(b.length_m)},
+          {"base_radius_m", finite(b.base_radius_m)},
+          {"middle_radius_m", finite(b.middle_radius_m)},
+          {"tip_radius_m", finite(b.tip_radius_m)},
+          {"base_radius_sigma_m", finite(b.base_radius_sigma_m)},
+          {"angle_rad", finite(b.angle_rad)},
+          {"azimuth_rad", finite(b.azimuth_rad)},
+          {"zenith_rad", finite(b.zenith_rad)},
+          {"height_m", finite(b.height_m)}};
+}
+
+Json TreeJson(const MapTree& t) {
+  const auto finite = [&](double v) { return Finite(v, "a number of tree", t.id); };
+  return {{"id", t.id},
+          {"trunk_branch_id", t.trunk_branch_id},
+          {"branch_ids", t.branch_ids},
+          {"base", VecJson(t.base, "the base of tree", t.id)},
+          {"dbh_height_m", finite(t.dbh_height_m)},
+          {"dbh_m", t.dbh_m ? Json(finite(*t.dbh_m)) : Json(nullptr)},
+          {"dbh_sigma_m", finite(t.dbh_sigma_m)},
+          {"height_m", finite(t.height_m)},
+          {"max_branch_order", t.max_branch_order},
+          {"stem_volume_m3", finite(t.stem_volume_m3)},
+          {"wood_volume_m3", finite(t.wood_volume_m3)},
+          {"min_radius_m", finite(t.min_radius_m)},
+          {"volume_sigma_m3", finite(t.volume_sigma_m3)},
+          {"lean_rad", finite(t.lean_rad)},
+          {"arc_coverage_rad", finite(t.arc_coverage_rad)},
+          {"num_scans", t.num_scans}};
+}
+
+Json TopologyJson(const TopologyState& state) {
+  Json j;
+  j["next_branch_id"] = state.next_branch_id;
+  j["next_tree_id"] = state.next_tree_id;
+  j["next_cylinder_id"] = state.next_cylinder_id;
+  j["branch_of_landmark"] = Json::array();
+  for (const auto& [landmark, branch] : state.branch_of_landmark) {
+    j["branch_of_landmark"].push_back({landmark, branch});
+  }
+  j["tree_of_branch"] = Json::array();
+  for (const auto& [branch, tree] : state.tree_of_branch) j["tree_of_branch"].push_back({branch, tree});
+  j["sections"] = Json::array();
+  for (const auto& [key, sections] : state.sections) {
+    Json list = Json::array();
+    for (const TopologyState::Section& section : sections) {
+      list.push_back({{"id", section.id},
+                      {"middle", VecJson(section.middle, "the middle of cylinder", section.id)}});
+    }
+    j["sections"].push_back({{"key", {key.first, key.second}}, {"cylinders", std::move(list)}});
+  }
+  return j;
+}
+
+// -------------------------------------------------------------------------------------------
+// JSON, reading: every access names the field in its error
+// -------------------------------------------------------------------------------------------
+
+class Reader {
+ public:
+  Reader(const Json& json, const std::string& file, std::string path)
+      : json_(json), file_(file), path_(std::move(path)) {}
+
+  [[noreturn]] void Fail(const std::string& problem) const {
+    throw MapFileError(
+        fmt::format("{}: {} {}", file_, path_.empty() ? std::string("the file") : path_, problem));
+  }
+
+  Reader operator[](const char* key) const {
+    const std::string path = path_.empty() ? std::string(key) : path_ + "." + key;
+    if (!json_.is_object()) Fail("is not an object");
+    const auto it = json_.find(key);
+    if (it == json_.end()) Reader(json_, file_, path).Fail("is missing");
+    return Reader(*it, file_, path);
+  }
+
+  Reader At(std::size_t index) const {
+    return Reader(json_.at(index), file_, fmt::format("{}[{}]", path_, index));
+  }
+
+  std::size_t ArraySize() const {
+    if (!json_.is_array()) Fail("is not a list");
+    return json_.size();
+  }
+
+  void RequireSize(std::size_t size) const {
+    if (ArraySize() != size) Fail(fmt::format("must hold {} entries", size));
+  }
+
+  bool IsNull() const { return json_.is_null(); }
+
+  double Double() const {
+    if (!json_.is_number()) Fail("is not a finite number");
+    const double value = json_.get<double>();
+    if (!std::isfinite(value)) Fail("is not a finite number");
+    return value;
+  }
+
+  std::int64_t Int64() const {
+    if (!json_.is_number_integer()) Fail("is not an integer");
+    if (json_.is_number_unsigned() &&
+        json_.get<std::uint64_t>() > static_cast<std::uint64_t>(INT64_MAX)) {
+      Fail("is out of range");
+    }
+    return json_.get<std::int64_t>();
+  }
+
+  int Int() const {
+    const std::int64_t value = Int64();
+    if (value < INT32_MIN || value > INT32_MAX) Fail("is out of range");
+    return static_cast<int>(value);
+  }
+
+  int NonNegative() const {
+    const int value = Int();
+    if (value < 0) Fail("is negative");
+    return value;
+  }
+
+  bool Bool() const {
+    if (!json_.is_boolean()) Fail("is not true or false");
+    return json_.get<bool>();
+  }
+
+  std::string String() const {
+    if (!json_.is_string()) Fail("is not a text");
+    return json_.get<std::string>();
+  }
+
+  Eigen::Vector3d Vector() const {
+    RequireSize(3);
+    return {At(0).Double(), At(1).Double(), At(2).Double()};
+  }
+
+  Eigen::Vector3d UnitVector() const {
+    const Eigen::Vector3d v = Vector();
+    if (std::abs(v.norm() - 1.0) > 1e-6) Fail("is not a unit vector");
+    return v;
+  }
+
+  std::vector<int> Ints() const {
+    std::vector<int> values(ArraySize());
+    for (std::size_t i = 0; i < values.size(); ++i) values[i] = At(i).Int();
+    return values;
+  }
+
+  const Json& json() const { return json_; }
+
+ private:
+  const Json& json_;
+  const std::string& file_;
+  std::string path_;
+};
+
+Landmark ReadLandmark(const Reader& j) {
+  Landmark landmark;
+  landmark.id = j["id"].NonNegative();
+  landmark.confirmed = j["confirmed"].Bool();
+  landmark.cylinder.axis = j["axis"].UnitVector();
+  landmark.cylinder.point = j["point"].Vector();
+  landmark.cylinder.curvature = j["curvature"].Double();
+  if (!(landmark.cylinder.curvature > 0.0)) j["curvature"].Fail("is not positive");
+  const Reader covariance = j["covariance_upper"];
+  covariance.RequireSize(15);
+  std::size_t k = 0;
+  for (int r = 0; r < 5; ++r) {
+    for (int c = r; c < 5; ++c, ++k) {
+      landmark.covariance(r, c) = landmark.covariance(c, r) = covariance.At(k).Double();
+    }
+  }
+  landmark.s_min_m = j["s_min_m"].Double();
+  landmark.s_max_m = j["s_max_m"].Double();
+  if (landmark.s_max_m < landmark.s_min_m) j["s_max_m"].Fail("is below s_min_m");
+  landmark.s_min_sigma_m = j["s_min_sigma_m"].Double();
+  landmark.s_max_sigma_m = j["s_max_sigma_m"].Double();
+  const Reader profile = j["profile"];
+  const std::size_t knots = profile.ArraySize();
+  for (std::size_t i = 0; i < knots; ++i) {
+    RadiusKnot knot;
+    knot.s_m = profile.At(i)["s_m"].Double();
+    knot.radius_m = profile.At(i)["radius_m"].Double();
+    knot.radius_sigma_m = profile.At(i)["radius_sigma_m"].Double();
+    knot.num_scans = profile.At(i)["num_scans"].Int();
+    if (!landmark.profile.empty() && knot.s_m < landmark.profile.back().s_m) {
+      profile.At(i)["s_m"].Fail("is not in ascending order");
+    }
+    landmark.profile.push_back(knot);
+  }
+  landmark.num_scans = j["num_scans"].NonNegative();
+  landmark.num_points = j["num_points"].NonNegative();
+  const std::string arc = j["arc_seen"].String();
+  if (arc.size() != Landmark::kArcBins || arc.find_first_not_of("01") != std::string::npos) {
+    j["arc_seen"].Fail(fmt::format("must be {} digits 0 or 1", Landmark::kArcBins));
+  }
+  landmark.arc_seen = std::bitset<Landmark::kArcBins>(arc);
+  landmark.mean_abs_deviation_m = j["mean_abs_deviation_m"].Double();
+  return landmark;
+}
+
+FitStatus ReadStatus(const Reader& j) {
+  const std::string text = j.String();
+  for (const FitStatus status :
+       {FitStatus::kMeasured, FitStatus::kUnresolved, FitStatus::kInferred}) {
+    if (text == ToString(status)) return status;
+  }
+  j.Fail("is none of MEASURED, UNRESOLVED, INFERRED");
+}
+
+MapCylinder ReadCylinder(const Reader& j) {
+  MapCylinder c;
+  c.id = j["id"].NonNegative();
+  c.landmark_id = j["landmark_id"].Int();
+  c.tree_id = j["tree_id"].Int();
+  c.branch_id = j["branch_id"].Int();
+  c.parent_id = j["parent_id"].Int();
+  c.branch_order = j["branch_order"].Int();
+  c.position_in_branch = j["position_in_branch"].Int();
+  c.start = j["start"].Vector();
+  c.end = j["end"].Vector();
+  c.radius_m = j["radius_m"].Double();
+  c.radius_sigma_m = j["radius_sigma_m"].Double();
+  c.taper_m_per_m = j["taper_m_per_m"].Double();
+  c.axis_sigma_rad = j["axis_sigma_rad"].Double();
+  c.position_sigma_m = j["position_sigma_m"].Double();
+  c.num_scans = j["num_scans"].Int();
+  c.num_points = j["num_points"].Int();
+  c.visible_arc_rad = j["visible_arc_rad"].Double();
+  c.mean_abs_deviation_m = j["mean_abs_deviation_m"].Double();
+  c.status = ReadStatus(j["status"]);
+  return c;
+}
+
+MapBranch ReadBranch(const Reader& j) {
+  MapBranch b;
+  b.id = j["id"].NonNegative();
+  b.tree_id = j["tree_id"].Int();
+  b.parent_id = j["parent_id"].Int();
+  b.order = j["order"].Int();
+  b.cylinder_ids = j["cylinder_ids"].Ints();
+  b.base = j["base"].Vector();
+  b.tip = j["tip"].Vector();
+  b.length_m = j["length_m"].Double();
+  b.base_radius_m = j["base_radius_m"].Double();
+  b.middle_radius_m = j["middle_radius_m"].Double();
+  b.tip_radius_m = j["tip_radius_m"].Double();
+  b.base_radius_sigma_m = j["base_radius_sigma_m"].Double();
+  b.angle_rad = j["angle_rad"].Double();
+  b.azimuth_rad = j["azimuth_rad"].Double();
+  b.zenith_rad = j["zenith_rad"].Double();
+  b.height_m = j["height_m"].Double();
+  return b;
+}
+
+MapTree ReadTree(const Reader& j) {
+  MapTree t;
+  t.id = j["id"].NonNegative();
+  t.trunk_branch_id = j["trunk_branch_id"].Int();
+  t.branch_ids = j["branch_ids"].Ints();
+  t.base = j["base"].Vector();
+  t.dbh_height_m = j["dbh_height_m"].Double();
+  if (!j["dbh_m"].IsNull()) t.dbh_m = j["dbh_m"].Double();
+  t.dbh_sigma_m = j["dbh_sigma_m"].Double();
+  t.height_m = j["height_m"].Double();
+  t.max_branch_order = j["max_branch_order"].Int();
+  t.stem_volume_m3 = j["stem_volume_m3"].Double();
+  t.wood_volume_m3 = j["wood_volume_m3"].Double();
+  t.min_radius_m = j["min_radius_m"].Double();
+  t.volume_sigma_m3 = j["volume_sigma_m3"].Double();
+  t.lean_rad = j["lean_rad"].Double();
+  t.arc_coverage_rad = j["arc_coverage_rad"].Double();
+  t.num_scans = j["num_scans"].Int();
+  return t;
+}
+
+TopologyState ReadTopology(const Reader& j) {
+  TopologyState state;
+  state.next_branch_id = j["next_branch_id"].NonNegative();
+  state.next_tree_id = j["next_tree_id"].NonNegative();
+  state.next_cylinder_id = j["next_cylinder_id"].NonNegative();
+  const auto read_pairs = [](const Reader& list, int next, std::map<int, int>* map) {
+    const std::size_t size = list.ArraySize();
+    for (std::size_t i = 0; i < size; ++i) {
+      list.At(i).RequireSize(2);
+      const int value = list.At(i).At(1).NonNegative();
+      if (value >= next) list.At(i).Fail("names an id that was never given");
+      (*map)[list.At(i).At(0).NonNegative()] = value;
+    }
+  };
+  read_pairs(j["branch_of_landmark"], state.next_branch_id, &state.branch_of_landmark);
+  read_pairs(j["tree_of_branch"], state.next_tree_id, &state.tree_of_branch);
+  const Reader sections = j["sections"];
+  const std::size_t size = sections.ArraySize();
+  for (std::size_t i = 0; i < size; ++i) {
+    const std::vector<int> key = sections.At(i)["key"].Ints();
+    if (key.size() != 2) sections.At(i)["key"].Fail("must hold 2 entries");
+    const Reader list = sections.At(i)["cylinders"];
+    std::vector<TopologyState::Section>& target = state.sections[{key[0], key[1]}];
+    const std::size_t count = list.ArraySize();
+    for (std::size_t k = 0; k < count; ++k) {
+      const int id = list.At(k)["id"].NonNegative();
+      if (id >= state.next_cylinder_id) list.At(k)["id"].Fail("names an id that was never given");
+      target.push_back({id, list.At(k)["middle"].Vector()});
+    }
+  }
+  return state;
+}
+
+std::string ReadFile(const std::string& path) {
+  std::ifstream stream(path, std::ios::binary);
+  if (!stream) throw MapFileError(fmt::format("cannot read {}: {}", path, std::strerror(errno)));
+  std::ostringstream content;
+  content << stream.rdbuf();
+  if (stream.bad()) throw MapFileError(fmt::format("cannot read {}: input error", path));
+  return content.str();
+}
+
+// "12.345678901" to nanoseconds without passing through a double.
+std::optional<std::int64_t> ParseStamp(const std::string& text) {
+  const std::size_t dot = text.find('.');
+  const std::string whole = text.substr(0, dot);
+  std::string fraction = dot == std::string::npos ? std::string() : text.substr(dot + 1);
+  const bool negative = !whole.empty() && whole[0] == '-';
+  const std::string digits = negative ? whole.substr(1) : whole;
+  const auto numeric = [](const std::string& s) {
+    return s.find_first_not_of("0123456789") == std::string::npos;
+  };
+  if (digits.empty() || digits.size() > 10 || !numeric(digits) || !numeric(fraction)) {
+    return std::nullopt;
+  }
+  fraction.resize(9, '0');
+  const std::int64_t ns = std::stoll(digits) * 1000000000 + std::stoll(fraction);
+  return negative ? -ns : ns;
+}
+
+std::vector<StampedPose> ReadTrajectory(const std::string& path) {
+  std::istringstream stream(ReadFile(path));
+  std::vector<StampedPose> trajectory;
+  std::string line;
+  for (int number = 1; std::getline(stream, line); ++number) {
+    if (line.empty() || line[0] == '#') continue;
+    std::istringstream fields(line);
+    std::string stamp;
+    double v[7];
+    fields >> stamp;
+    for (double& value : v) fields >> value;
+    const std::optional<std::int64_t> ns = ParseStamp(stamp);
+    const Eigen::Quaterniond q(v[6], v[3], v[4], v[5]);
+    if (!fields || !ns || !(std::abs(q.norm() - 1.0) < 1e-3)) {
+      throw MapFileError(fmt::format(
+          "{}: line {} is not 'stamp x y z qx qy qz qw' with a unit quaternion", path, number));
+    }
+    StampedPose pose;
+    pose.stamp_ns = *ns;
+    pose.T_map_lidar.linear() = q.normalized().toRotationMatrix();
+    pose.T_map_lidar.translation() = Eigen::Vector3d(v[0], v[1], v[2]);
+    trajectory.push_back(pose);
+  }
+  return trajectory;
+}
+
+}  // namespace
+
+// ---------------------------------------------------------------------------------------------
+// Contents
+// ---------------------------------------------------------------------------------------------
+
+std::string CylindersCsv(const TreeModel& model) {
+  std::string out =
+      "tree_id,branch_id,cylinder_id,parent_cylinder_id,branch_order,position_in_branch,"
+      "start_x,start_y,start_z,end_x,end_y,end_z,axis_x,axis_y,axis_z,length_m,radius_m,"
+      "radius_sigma_m,taper_m_per_m,axis_sigma_deg,position_sigma_m,num_scans,num_points,"
+      "visible_arc_deg,mad_m,status\n";
+  for (const MapCylinder& c : model.cylinders) {
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
+                       Optional(c.tree_id),
+                       c.branch_id,
+                       c.id,
+                       Optional(c.parent_id),
+                       c.branch_order,
+                       c.position_in_branch,
+                       Vec(c.start),
+                       Vec(c.end),
+                       Vec(c.Length() > 0.0 ? c.Axis() : Eigen::Vector3d::Zero()),
+                       Num(c.Length()),
+                       Num(c.radius_m),
+                       Num(c.radius_sigma_m),
+                       Num(c.taper_m_per_m),
+                       Num(c.axis_sigma_rad * kDegPerRad, 4),
+                       Num(c.position_sigma_m),
+                       c.num_scans,
+                       c.num_points,
+                       Num(c.visible_arc_rad * kDegPerRad, 1),
+                       Num(c.mean_abs_deviation_m),
+                       ToString(c.status));
+  }
+  return out;
+}
+
+std::string BranchesCsv(const TreeModel& model) {
+  std::map<int, std::pair<int, int>> counts;  // branch -> cylinders, of them measured
+  for (const MapCylinder& c : model.cylinders) {
+    ++counts[c.branch_id].first;
+    if (c.status == FitStatus::kMeasured) ++counts[c.branch_id].second;
+  }
+  std::string out =
+      "tree_id,branch_id,parent_branch_id,branch_order,num_cylinders,num_measured,"
+      "base_x,base_y,base_z,tip_x,tip_y,tip_z,length_m,base_diameter_m,base_diameter_sigma_m,"
+      "middle_diameter_m,tip_diameter_m,angle_deg,azimuth_deg,zenith_deg,height_m\n";
+  for (const MapBranch& b : model.branches) {
+    const auto [cylinders, measured] = counts[b.id];
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
+                       Optional(b.tree_id),
+                       b.id,
+                       Optional(b.parent_id),
+                       b.order,
+                       cylinders,
+                       measured,
+                       Vec(b.base),
+                       Vec(b.tip),
+                       Num(b.length_m),
+                       Num(2.0 * b.base_radius_m),
+                       Num(2.0 * b.base_radius_sigma_m),
+                       Num(2.0 * b.middle_radius_m),
+                       Num(2.0 * b.tip_radius_m),
+                       b.parent_id >= 0 ? Num(b.angle_rad * kDegPerRad, 3) : std::string(),
+                       Num(b.azimuth_rad * kDegPerRad, 3),
+                       Num(b.zenith_rad * kDegPerRad, 3),
+                       b.tree_id >= 0 ? Num(b.height_m) : std::string());
+  }
+  return out;
+}
+
+std::string TreesCsv(const TreeModel& model) {
+  std::string out =
+      "tree_id,x,y,z,dbh_m,dbh_sigma_m,dbh_height_m,height_m,num_branches,max_branch_order,"
+      "stem_volume_m3,wood_volume_m3_above_min_radius,min_radius_m,volume_sigma_m3,lean_deg,"
+      "arc_coverage_deg,num_scans,status\n";
+  for (const MapTree& t : model.trees) {
+    const std::size_t branches = t.branch_ids.empty() ? 0 : t.branch_ids.size() - 1;
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
+                       t.id,
+                       Vec(t.base),
+                       t.dbh_m ? Num(*t.dbh_m) : std::string(),
+                       t.dbh_m ? Num(t.dbh_sigma_m) : std::string(),
+                       Num(t.dbh_height_m, 4),
+                       Num(t.height_m),
+                       branches,
+                       t.max_branch_order,
+                       Num(t.stem_volume_m3),
+                       Num(t.wood_volume_m3),
+                       Num(t.min_radius_m),
+                       Num(t.volume_sigma_m3),
+                       Num(t.lean_rad * kDegPerRad, 3),
+                       Num(t.arc_coverage_rad * kDegPerRad, 1),
+                       t.num_scans,
+                       ToString(t.dbh_m ? FitStatus::kMeasured : FitStatus::kUnresolved));
+  }
+  return out;
+}
+
+std::string TrajectoryTum(const std::vector<StampedPose>& trajectory) {
+  std::string out;
+  for (const StampedPose& pose : trajectory) {
+    const Eigen::Vector3d t = pose.T_map_lidar.translation();
+    Eigen::Quaterniond q(pose.T_map_lidar.rotation());
+    if (q.w() < 0.0) q.coeffs() = -q.coeffs();
+    out += fmt::format("{} {} {} {} {} {} {} {}\n",
+                       Stamp(pose.stamp_ns),
+                       Num(t.x(), 9),
+                       Num(t.y(), 9),
+                       Num(t.z(), 9),
+                       Num(q.x(), 9),
+                       Num(q.y(), 9),
+                       Num(q.z(), 9),
+                       Num(q.w(), 9));
+  }
+  return out;
+}
+
+std::string TimingJson(const StageTimer& timer) {
+  const auto rounded = [](double ms) { return std::round(ms * 1000.0) / 1000.0; };
+  Json j;
+  j["stages"] = Json::object();
+  for (const auto& [stage, summary] : timer.Summaries()) {
+    j["stages"][stage] = {{"count", summary.count},
+                          {"p50_ms", rounded(summary.p50_ms)},
+                          {"p99_ms", rounded(summary.p99_ms)},
+                          {"max_ms", rounded(summary.max_ms)},
+                          {"total_ms", rounded(summary.total_ms)}};
+  }
+  j["data_duration_s"] = rounded(timer.data_duration_s());
+  j["wall_duration_s"] = rounded(timer.wall_duration_s());
+  j["realtime_factor"] = timer.wall_duration_s() > 0.0
+                             ? Json(rounded(timer.data_duration_s() / timer.wall_duration_s()))
+                             : Json(nullptr);
+  return j.dump(2) + "\n";
+}
+
+std::string TreeMapJson(const MapFiles& files) {
+  Json j;
+  j["format"] = kFormatName;
+  j["version"] = kFormatVersion;
+  j["frame"] = files.frame;
+  j["stamp_ns"] = files.model.stamp_ns;
+  j["next_landmark_id"] = files.next_landmark_id;
+  j["config"] = files.config;
+  j["trees"] = Json::array();
+  for (const MapTree& tree : files.model.trees) j["trees"].push_back(TreeJson(tree));
+  j["branches"] = Json::array();
+  for (const MapBranch& branch : files.model.branches) j["branches"].push_back(BranchJson(branch));
+  j["cylinders"] = Json::array();
+  for (const MapCylinder& c : files.model.cylinders) j["cylinders"].push_back(CylinderJson(c));
+  j["landmarks"] = Json::array();
+  for (const Landmark& landmark : files.landmarks) j["landmarks"].push_back(LandmarkJson(landmark));
+  j["topology"] = TopologyJson(files.topology);
+  return j.dump(1) + "\n";
+}
+
+// ---------------------------------------------------------------------------------------------
+// Directory
+// ---------------------------------------------------------------------------------------------
+
+void WriteFileAtomically(const std::string& path, const std::string& content) {
+  const std::string temporary = TemporaryName(path);
+  WriteSynced(temporary, content);
+  if (::rename(temporary.c_str(), path.c_str()) != 0) {
+    const int error = errno;
+    ::unlink(temporary.c_str());
+    FailWrite(path, error);
+  }
+}
+
+void SaveMap(const std::string& directory, const MapFiles& files, const StageTimer* timer) {
+  std::vector<std::pair<std::string, std::string>> contents;
+  contents.emplace_back("cylinders.csv", CylindersCsv(files.model));
+  contents.emplace_back("branches.csv", BranchesCsv(files.model));
+  contents.emplace_back("trees.csv", TreesCsv(files.model));
+  contents.emplace_back("trajectory.tum", TrajectoryTum(files.trajectory));
+  contents.emplace_back("tree.ply", MeshToPly(ModelMesh(files.model, MeshColor::kByBranch)));
+  if (timer != nullptr) contents.emplace_back("timing.json", TimingJson(*timer));
+  contents.emplace_back("tree_map.json", TreeMapJson(files));
+
+  MakeDirectory(directory);
+  const std::filesystem::path root(directory);
+  std::vector<std::string> temporaries;
+  try {
+    for (const auto& [name, content] : contents) {
+      temporaries.push_back(TemporaryName((root / name).string()));
+      WriteSynced(temporaries.back(), content);
+    }
+    for (std::size_t i = 0; i < contents.size(); ++i) {
+      const std::string path = (root / contents[i].first).string();
+      if (::rename(temporaries[i].c_str(), path.c_str()) != 0) FailWrite(path, errno);
+    }
+  } catch (const MapFileError&) {
+    for (const std::string& temporary : temporaries) ::unlink(temporary.c_str());
+    throw;
+  }
+  SyncDirectory(directory);
+}
+
+MapFiles LoadMap(const std::string& directory) {
+  const std::filesystem::path root(directory);
+  const std::string file = (root / "tree_map.json").string();
+  Json json;
+  try {
+    json = Json::parse(ReadFile(file));
+  } catch (const Json::exception& error) {
+    throw MapFileError(fmt::format("{}: the file is not JSON: {}", file, error.what()));
+  }
+  const Reader j(json, file, "");
+  if (j["format"].String() != kFormatName) j["format"].Fail(fmt::format("is not '{}'", kFormatName));
+  const int version = j["version"].Int();
+  if (version != kFormatVersion) {
+    j["version"].Fail(fmt::format("is {}, this program reads {}", version, kFormatVersion));
+  }
+
+  MapFiles files;
+  files.frame = j["frame"].String();
+  files.model.stamp_ns = j["stamp_ns"].Int64();
+  files.next_landmark_id = j["next_landmark_id"].NonNegative();
+  const Reader config = j["config"];
+  if (!config.json().is_object()) config.Fail("is not an object");
+  for (const auto& item : config.json().items()) {
+    files.config[item.key()] = config[item.key().c_str()].String();
+  }
+  const auto read_list = [&](const char* key, auto read, auto* target) {
+    const Reader list = j[key];
+    const std::size_t size = list.ArraySize();
+    std::set<int> ids;
+    for (std::size_t i = 0; i < size; ++i) {
+      target->push_back(read(list.At(i)));
+      if (!ids.insert(target->back().id).second) list.At(i)["id"].Fail("is used twice");
+    }
+    return ids;
+  };
+  read_list("trees", ReadTree, &files.model.trees);
+  read_list("branches", ReadBranch, &files.model.branches);
+  read_list("cylinders", ReadCylinder, &files.model.cylinders);
+  const std::set<int> landmark_ids = read_list("landmarks", ReadLandmark, &files.landmarks);
+  if (!landmark_ids.empty() && *landmark_ids.rbegin() >= files.next_landmark_id) {
+    j["next_landmark_id"].Fail("is not above every landmark's id");
+  }
+  files.topology = ReadTopology(j["topology"]);
+
+  const std::filesystem::path trajectory = root / "trajectory.tum";
+  if (std::filesystem::exists(trajectory)) files.trajectory = ReadTrajectory(trajectory.string());
+  return files;
+}
+
+// ---------------------------------------------------------------------------------------------
+// Scans
+// ---------------------------------------------------------------------------------------------
+
+namespace {
+
+constexpr const char* kScanFiles[] = {"scan_cylinders.csv", "scan_labels.bin", "scan_segments.bin"};
+
+template <class T>
+void WriteLittleEndian(std::ofstream& stream, T value) {
+  char bytes[sizeof(T)];
+  auto bits = static_cast<std::make_unsigned_t<T>>(value);
+  for (char& byte : bytes) {
+    byte = static_cast<char>(bits & 0xff);
+    if constexpr (sizeof(T) > 1) bits = static_cast<std::make_unsigned_t<T>>(bits >> 8);
+  }
+  stream.write(bytes, sizeof(T));
+}
+
+}  // namespace
+
+void ScanWriter::Check(std::ofstream& stream, const std::string& name) {
+  if (!stream) FailWrite((std::filesystem::path(directory_) / name).string(), errno);
+}
+
+ScanWriter::ScanWriter(const std::string& directory) : directory_(directory) {
+  MakeDirectory(directory);
+  std::ofstream* streams[] = {&cylinders_, &labels_, &segments_};
+  for (int i = 0; i < 3; ++i) {
+    const std::string path = (std::filesystem::path(directory) / kScanFiles[i]).string();
+    streams[i]->open(TemporaryName(path), std::ios::binary | std::ios::trunc);
+    Check(*streams[i], kScanFiles[i]);
+  }
+  cylinders_ << "stamp,segment,num_points,num_rings,distance_m,visible_arc_deg,"
+                "axis_x,axis_y,axis_z,point_x,point_y,point_z,radius_m,"
+                "sigma_axis_1_deg,sigma_axis_2_deg,sigma_position_1_m,sigma_position_2_m,"
+                "sigma_radius_m,start_x,start_y,start_z,end_x,end_y,end_z,end_sigma_m,"
+                "taper_m_per_m,mad_m,status,reason\n";
+  labels_ << "DSLABEL1";
+  segments_ << "DSSEGMT1";
+}
+
+ScanWriter::~ScanWriter() {
+  if (finished_) return;
+  for (const char* name : kScanFiles) {
+    ::unlink(TemporaryName((std::filesystem::path(directory_) / name).string()).c_str());
+  }
+}
+
+void ScanWriter::Add(const LabelledScan& scan,
+                     const std::vector<Segment>& segments,
+                     const std::vector<FittedCylinder>& cylinders) {
+  const std::int64_t stamp = scan.image.stamp_ns;
+  for (const FittedCylinder& fit : cylinders) {
+    const bool measured = fit.status == FitStatus::kMeasured;
+    const Eigen::Vector3d start = fit.cylinder.point + fit.start_s_m * fit.cylinder.axis;
+    const Eigen::Vector3d end = fit.cylinder.point + fit.end_s_m * fit.cylinder.axis;
+    const auto sigma = [&](int i) { return std::sqrt(std::max(0.0, fit.covariance(i, i))); };
+    cylinders_ << fmt::format("{},{},{},{},{},{},", Stamp(stamp), fit.segment_id, fit.num_points,
+                              fit.num_rings, Num(fit.distance_m),
+                              Num(fit.visible_arc_rad * kDegPerRad, 2));
+    if (measured) {
+      cylinders_ << fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},",
+                                Vec(fit.cylinder.axis),
+                                Vec(fit.cylinder.point),
+                                Num(fit.cylinder.radius()),
+                                Num(sigma(0) * kDegPerRad, 4),
+                                Num(sigma(1) * kDegPerRad, 4),
+                                Num(sigma(2)),
+                                Num(sigma(3)),
+                                Num(fit.radius_sigma_m()),
+                                Vec(start),
+                                Vec(end),
+                                Num(fit.end_sigma_m),
+                                Num(fit.taper_m_per_m),
+                                Num(fit.mean_abs_deviation_m));
+    } else {
+      cylinders_ << std::string(21, ',');
+    }
+    cylinders_ << ToString(fit.status) << ',' << (measured ? "" : ToString(fit.reason)) << '\n';
+  }
+  Check(cylinders_, kScanFiles[0]);
+
+  const std::vector<Label> labels = PointLabels(scan);
+  WriteLittleEndian(labels_, stamp);
+  WriteLittleEndian(labels_, static_cast<std::uint32_t>(labels.size()));
+  for (const Label label : labels) WriteLittleEndian(labels_, static_cast<std::uint8_t>(label));
+  Check(labels_, kScanFiles[1]);
+
+  std::vector<std::int32_t> segment_of_pixel(scan.image.size(), -1);
+  for (const Segment& segment : segments) {
+    for (const std::int32_t pixel : segment.pixels) {
+      segment_of_pixel[static_cast<std::size_t>(pixel)] = segment.id;
+    }
+  }
+  WriteLittleEndian(segments_, stamp);
+  WriteLittleEndian(segments_, static_cast<std::uint32_t>(scan.image.pixel_of_point.size()));
+  for (const std::int32_t pixel : scan.image.pixel_of_point) {
+    const std::int32_t id =
+        pixel < 0 ? std::int32_t{-1} : segment_of_pixel[static_cast<std::size_t>(pixel)];
+    WriteLittleEndian(segments_, id);
+  }
+  Check(segments_, kScanFiles[2]);
+}
+
+void ScanWriter::Finish() {
+  std::ofstream* streams[] = {&cylinders_, &labels_, &segments_};
+  for (int i = 0; i < 3; ++i) {
+    streams[i]->close();
+    Check(*streams[i], kScanFiles[i]);
+  }
+  for (const char* name : kScanFiles) {
+    const std::string path = (std::filesystem::path(directory_) / name).string();
+    if (::rename(TemporaryName(path).c_str(), path.c_str()) != 0) FailWrite(path, errno);
+  }
+  finished_ = true;
+}
+
+}  // namespace dendro
