@@ -1,0 +1,686 @@
+#!/usr/bin/python3
+"""Trains the network of stage 1 (wood in the range image) on simulated scans.
+
+  scripts/train_segmentation.py                     simulate data if there is none, train, export
+  scripts/train_segmentation.py --resume            go on where an interrupted training stopped
+  scripts/train_segmentation.py --evaluate FILE     score a weights file on the held-out scans
+  scripts/train_segmentation.py --fixture DIR       write the small network the C++ test compares with
+
+The data comes from the program simulate_training_scans (scripts/build builds it): range images
+already turned into the input planes of dendro_slam/segmentation/network_input.h, and a label per
+pixel. Training is in two steps as in the thesis: first the encoder with a coarse head on the
+downsampled labels, then the decoder with the encoder frozen; a third, joint step (a deviation)
+follows, because the skip connections hand the encoder's fine features to the decoder.
+
+Needs only Debian's python3-torch and python3-numpy. Uses a GPU if PyTorch sees one.
+"""
+import argparse
+import datetime
+import json
+import os
+import pathlib
+import struct
+import subprocess
+import sys
+import time
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+CLASSES = ["ground", "wood", "leaf", "other"]
+WOOD = 1
+PLANES = 8
+MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE = range(PLANES)
+IGNORE = 255
+
+LAYERS = ("stem:20:3x5:1x2 nb:1x1 push "
+          "down:40:2x2 nb:1x1 nb:1x2 push "
+          "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
+          "up:40:2x2 add nb:1x1 "
+          "up:20:2x2 add nb:1x1 "
+          "out:4:3x4:1x2")
+FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x2 nb:2x4 "
+                  "up:10:2x2 add up:6:2x2 add nb:1x1 out:4:3x4:1x2")
+
+
+# ---------------------------------------------------------------------------------------------
+# Network. The words of a layer list are described in dendro_slam/segmentation/erfnet.h.
+# ---------------------------------------------------------------------------------------------
+def pair(text):
+    return tuple(int(v) for v in text.split("x"))
+
+
+def batch_norm(channels):
+    return nn.BatchNorm2d(channels, eps=1e-3)
+
+
+class Stem(nn.Module):
+    def __init__(self, c_in, c_out, kernel, stride):
+        super().__init__()
+        self.conv = nn.Conv2d(c_in, c_out, kernel, stride, (kernel[0] // 2, kernel[1] // 2), bias=False)
+        self.bn = batch_norm(c_out)
+
+    def forward(self, x):
+        return F.relu(self.bn(self.conv(x)))
+
+    def export(self):
+        return fold("conv", self.conv, self.bn)
+
+
+class Down(nn.Module):
+    """Convolution beside max pooling, one batch normalisation over both (ERFNet)."""
+
+    def __init__(self, c_in, c_out, stride):
+        super().__init__()
+        self.conv = nn.Conv2d(c_in, c_out - c_in, 3, stride, 1, bias=False)
+        self.pool = nn.MaxPool2d(stride, stride)
+        self.bn = batch_norm(c_out)
+
+    def forward(self, x):
+        return F.relu(self.bn(torch.cat([self.conv(x), self.pool(x)], 1)))
+
+    def export(self):
+        scale, shift = affine(self.bn)
+        n = self.conv.weight.shape[0]
+        return {"conv.weight": self.conv.weight * scale[:n, None, None, None],
+                "conv.bias": shift[:n], "pool.weight": scale[n:], "pool.bias": shift[n:]}
+
+
+class NonBottleneck1d(nn.Module):
+    def __init__(self, c, dilation, dropout):
+        super().__init__()
+        dh, dw = dilation
+        self.conv1 = nn.Conv2d(c, c, (3, 1), 1, (1, 0))
+        self.conv2 = nn.Conv2d(c, c, (1, 3), 1, (0, 1), bias=False)
+        self.bn1 = batch_norm(c)
+        self.conv3 = nn.Conv2d(c, c, (3, 1), 1, (dh, 0), (dh, 1))
+        self.conv4 = nn.Conv2d(c, c, (1, 3), 1, (0, dw), (1, dw), bias=False)
+        self.bn2 = batch_norm(c)
+        self.dropout = nn.Dropout2d(dropout)
+
+    def forward(self, x):
+        y = F.relu(self.conv1(x))
+        y = F.relu(self.bn1(self.conv2(y)))
+        y = F.relu(self.conv3(y))
+        y = self.dropout(self.bn2(self.conv4(y)))
+        return F.relu(y + x)
+
+    def export(self):
+        return {"conv1.weight": self.conv1.weight, "conv1.bias": self.conv1.bias,
+                **fold("conv2", self.conv2, self.bn1),
+                "conv3.weight": self.conv3.weight, "conv3.bias": self.conv3.bias,
+                **fold("conv4", self.conv4, self.bn2)}
+
+
+def transposed(c_in, c_out, kernel, stride, bias):
+    padding = tuple((k - s + 1) // 2 for k, s in zip(kernel, stride))
+    extra = tuple(s - k + 2 * p for k, s, p in zip(kernel, stride, padding))
+    return nn.ConvTranspose2d(c_in, c_out, kernel, stride, padding, extra, bias=bias)
+
+
+class Up(nn.Module):
+    def __init__(self, c_in, c_out, stride):
+        super().__init__()
+        self.conv = transposed(c_in, c_out, (3, 3), stride, False)
+        self.bn = batch_norm(c_out)
+
+    def forward(self, x):
+        return F.relu(self.bn(self.conv(x)))
+
+    def export(self):
+        return fold("conv", self.conv, self.bn, out_axis=1)
+
+
+class Out(nn.Module):
+    def __init__(self, c_in, classes, kernel, stride):
+        super().__init__()
+        self.conv = transposed(c_in, classes, kernel, stride, True)
+
+    def forward(self, x):
+        return self.conv(x)
+
+    def export(self):
+        return {"conv.weight": self.conv.weight, "conv.bias": self.conv.bias}
+
+
+def affine(bn):
+    """Scale and shift of a batch normalisation at inference."""
+    scale = bn.weight / torch.sqrt(bn.running_var + bn.eps)
+    return scale, bn.bias - bn.running_mean * scale
+
+
+def fold(name, conv, bn, out_axis=0):
+    scale, shift = affine(bn)
+    shape = [1, 1, 1, 1]
+    shape[out_axis] = -1
+    return {name + ".weight": conv.weight * scale.view(shape), name + ".bias": shift}
+
+
+class ErfNet(nn.Module):
+    def __init__(self, layers, planes=PLANES, dropout=0.03):
+        super().__init__()
+        self.spec = layers
+        self.words = layers.split()
+        modules, stack, c = [], [], planes
+        self.encoder_length = 0
+        for word in self.words:
+            kind, *fields = word.split(":")
+            if kind == "stem":
+                modules.append(Stem(c, int(fields[0]), pair(fields[1]), pair(fields[2])))
+                c = int(fields[0])
+            elif kind == "down":
+                modules.append(Down(c, int(fields[0]), pair(fields[1])))
+                c = int(fields[0])
+            elif kind == "nb":
+                modules.append(NonBottleneck1d(c, pair(fields[0]), dropout))
+            elif kind == "up":
+                if not self.encoder_length:
+                    self.encoder_length = len(modules)
+                    self.coarse_channels = c
+                modules.append(Up(c, int(fields[0]), pair(fields[1])))
+                c = int(fields[0])
+            elif kind == "out":
+                modules.append(Out(c, int(fields[0]), pair(fields[1]), pair(fields[2])))
+            else:
+                modules.append(nn.Identity())
+        self.layers = nn.ModuleList(modules)
+        self.coarse_head = nn.Conv2d(self.coarse_channels, len(CLASSES), 1)
+
+    def encoder(self, x):
+        kept = []
+        for word, layer in zip(self.words[:self.encoder_length], self.layers):
+            if word == "push":
+                kept.append(x)
+            else:
+                x = layer(x)
+        return x, kept
+
+    def forward(self, x):
+        x, kept = self.encoder(x)
+        for word, layer in list(zip(self.words, self.layers))[self.encoder_length:]:
+            if word == "push":
+                kept.append(x)
+            elif word == "add":
+                x = x + kept.pop()
+            else:
+                x = layer(x)
+        return x
+
+    def coarse(self, x):
+        return self.coarse_head(self.encoder(x)[0])
+
+    def encoder_modules(self):
+        return list(self.layers[:self.encoder_length])
+
+    def export(self):
+        tensors = {}
+        for i, layer in enumerate(self.layers):
+            if hasattr(layer, "export"):
+                for name, value in layer.export().items():
+                    tensors[f"{i:02d}.{name}"] = value.detach().cpu().float().numpy()
+        metadata = {"format": "dendro_erfnet_1", "input": "dendro_range_planes_1",
+                    "input_channels": str(PLANES), "classes": ",".join(CLASSES),
+                    "layers": self.spec}
+        return tensors, metadata
+
+
+# ---------------------------------------------------------------------------------------------
+# safetensors, by hand: length, JSON header, data
+# ---------------------------------------------------------------------------------------------
+def write_safetensors(path, tensors, metadata=None):
+    header, blobs, offset = {}, [], 0
+    if metadata:
+        header["__metadata__"] = metadata
+    for name in sorted(tensors):
+        data = np.ascontiguousarray(tensors[name], dtype="<f4")
+        header[name] = {"dtype": "F32", "shape": list(data.shape),
+                        "data_offsets": [offset, offset + data.nbytes]}
+        blobs.append(data.tobytes())
+        offset += data.nbytes
+    text = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    path = pathlib.Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(struct.pack("<Q", len(text)) + text + b"".join(blobs))
+    os.replace(temporary, path)
+
+
+def read_safetensors(path):
+    raw = pathlib.Path(path).read_bytes()
+    size = struct.unpack("<Q", raw[:8])[0]
+    header = json.loads(raw[8:8 + size])
+    metadata = header.pop("__metadata__", {})
+    tensors = {}
+    for name, entry in header.items():
+        begin, end = entry["data_offsets"]
+        tensors[name] = np.frombuffer(raw[8 + size + begin:8 + size + end], "<f4").reshape(entry["shape"])
+    return tensors, metadata
+
+
+def load_exported(path):
+    """A network whose batch normalisations are identities, from an exported file."""
+    tensors, metadata = read_safetensors(path)
+    net = ErfNet(metadata["layers"])
+
+    def identity(bn, scale=None, shift=None):
+        bn.running_mean.zero_()
+        bn.running_var.fill_(1.0 - bn.eps)
+        bn.weight.copy_(torch.ones_like(bn.weight) if scale is None else scale)
+        bn.bias.copy_(torch.zeros_like(bn.bias) if shift is None else shift)
+
+    with torch.no_grad():
+        for i, layer in enumerate(net.layers):
+            def get(name):
+                return torch.from_numpy(tensors[f"{i:02d}.{name}"].copy())
+            if isinstance(layer, (Stem, Up)):
+                layer.conv.weight.copy_(get("conv.weight"))
+                identity(layer.bn, shift=get("conv.bias"))
+            elif isinstance(layer, Down):
+                layer.conv.weight.copy_(get("conv.weight"))
+                n = layer.conv.weight.shape[0]
+                identity(layer.bn, torch.cat([torch.ones(n), get("pool.weight")]),
+                         torch.cat([get("conv.bias"), get("pool.bias")]))
+            elif isinstance(layer, NonBottleneck1d):
+                for k in (1, 3):
+                    getattr(layer, f"conv{k}").weight.copy_(get(f"conv{k}.weight"))
+                    getattr(layer, f"conv{k}").bias.copy_(get(f"conv{k}.bias"))
+                for k, bn in ((2, layer.bn1), (4, layer.bn2)):
+                    getattr(layer, f"conv{k}").weight.copy_(get(f"conv{k}.weight"))
+                    identity(bn, shift=get(f"conv{k}.bias"))
+            elif isinstance(layer, Out):
+                layer.conv.weight.copy_(get("conv.weight"))
+                layer.conv.bias.copy_(get("conv.bias"))
+    return net.eval()
+
+
+# ---------------------------------------------------------------------------------------------
+# Data
+# ---------------------------------------------------------------------------------------------
+class Dataset:
+    """One folder of simulate_training_scans: meta.json, planes.f16, labels.u8."""
+
+    def __init__(self, folder):
+        folder = pathlib.Path(folder)
+        self.meta = json.loads((folder / "meta.json").read_text())
+        self.count, self.rows, self.cols = (self.meta[k] for k in ("count", "rows", "cols"))
+        if self.meta["planes"] != PLANES or self.meta["input"] != "dendro_range_planes_1":
+            raise SystemExit(f"train_segmentation: {folder} holds other input planes; simulate anew")
+        shape = (self.count, PLANES, self.rows, self.cols)
+        self.planes = np.memmap(folder / "planes.f16", "<f2", "r", shape=shape)
+        labels = np.fromfile(folder / "labels.u8", np.uint8).reshape(self.count, self.rows, self.cols)
+        self.labels = np.where(labels == 0, IGNORE, labels - 1).astype(np.uint8)
+        self.wood_columns = [np.flatnonzero((self.labels[i] == WOOD).any(0)) for i in range(self.count)]
+        self.busy_columns = [np.flatnonzero(((self.labels[i] != IGNORE) & (self.labels[i] != 0)).any(0))
+                             for i in range(self.count)]
+
+    def crop(self, index, start, width):
+        columns = (start + np.arange(width)) % self.cols
+        return (self.planes[index][:, :, columns].astype(np.float32),
+                self.labels[index][:, columns])
+
+
+def augment(x, y, rng):
+    """Yaw comes from the crop's place; here mirror, range scale, drop-out, intensity, ground."""
+    mask = x[MASK] > 0.5
+    if rng.random() < 0.5:
+        x, y, mask = x[:, :, ::-1].copy(), y[:, ::-1].copy(), mask[:, ::-1].copy()
+        # The step to the next column becomes the step from it.
+        step = x[LATERAL].copy()
+        x[LATERAL, :, :-1] = np.where(mask[:, 1:], -step[:, 1:], 1.0)
+        x[LATERAL, :, :-1][~mask[:, :-1]] = 0.0
+        # A pixel whose new neighbour was missing had been that neighbour's business: far.
+        x[LATERAL, :, -1] = np.where(mask[:, -1], 1.0, 0.0)
+        y[:, -1] = IGNORE
+    scale = np.exp(rng.uniform(-0.25, 0.25)) if rng.random() < 0.7 else 1.0
+    if scale != 1.0:
+        x[RANGE] += mask * (0.5 * np.log2(scale))
+        x[HEIGHT] = np.clip(x[HEIGHT] * scale, -1.0, 3.0)
+        for plane in (LATERAL, VERTICAL, RISE):
+            s = x[plane]
+            # s = d / (|d| + c) has d / c = s / (1 - |s|).
+            d = s / np.maximum(1.0 - np.abs(s), 1e-3) * scale
+            x[plane] = np.where(np.abs(s) > 0.998, s, d / (np.abs(d) + 1.0))
+    drop = rng.random(mask.shape) < rng.choice([0.0, 0.003, 0.03])
+    drop &= mask
+    if drop.any():
+        mask = mask & ~drop
+        left = np.zeros_like(drop)
+        left[:, :-1] = drop[:, 1:]
+        below = np.zeros_like(drop)
+        below[:-1] = drop[1:]
+        x[LATERAL][left & mask] = 1.0
+        x[VERTICAL][below & mask] = 1.0
+        x[RISE][below & mask] = 0.0
+        x[:, drop] = 0.0
+        y = np.where(drop, IGNORE, y).astype(np.uint8)
+    if rng.random() < 0.3:
+        x[INTENSITY] = -0.5 * mask
+    else:
+        gain = np.exp(rng.uniform(-0.4, 0.4))
+        x[INTENSITY] = np.clip((x[INTENSITY] + 0.5) * gain, 0.0, 2.0) * mask - 0.5 * mask
+    if rng.random() < 0.1:
+        x[HEIGHT] = 0.0
+        x[UP] = 0.0
+    return x, y
+
+
+def batches(data, rng, steps, size, width):
+    for _ in range(steps):
+        xs, ys = [], []
+        for _ in range(size):
+            i = int(rng.integers(data.count))
+            columns = data.wood_columns[i] if rng.random() < 0.75 else data.busy_columns[i]
+            if len(columns) and rng.random() < 0.9:
+                start = int(rng.choice(columns)) - int(rng.integers(width))
+            else:
+                start = int(rng.integers(data.cols))
+            x, y = augment(*data.crop(i, start, width), rng)
+            xs.append(x)
+            ys.append(y)
+        yield torch.from_numpy(np.stack(xs)), torch.from_numpy(np.stack(ys).astype(np.int64))
+
+
+# ---------------------------------------------------------------------------------------------
+# Losses and scores
+# ---------------------------------------------------------------------------------------------
+CLASS_WEIGHT = torch.tensor([0.6, 1.6, 1.0, 1.0])
+
+
+def fine_loss(logits, target):
+    ce = F.cross_entropy(logits, torch.where(target == IGNORE, -100, target),
+                         weight=CLASS_WEIGHT.to(logits.device))
+    # Soft intersection over union of wood, the score that counts.
+    valid = (target != IGNORE).float()
+    wood = (target == WOOD).float()
+    p = logits.softmax(1)[:, WOOD] * valid
+    both = (p * wood).sum()
+    return ce + 0.5 * (1.0 - (both + 1.0) / (p.sum() + wood.sum() - both + 1.0))
+
+
+def coarse_loss(logits, target):
+    """Cross-entropy against the class shares within each coarse cell."""
+    shares = torch.stack([(target == k).float() for k in range(len(CLASSES))], 1)
+    factor = (target.shape[1] // logits.shape[2], target.shape[2] // logits.shape[3])
+    shares = F.avg_pool2d(shares, factor)
+    total = shares.sum(1, keepdim=True)
+    weight = CLASS_WEIGHT.to(logits.device).view(1, -1, 1, 1)
+    ce = -(weight * shares * logits.log_softmax(1)).sum(1)
+    return ce.sum() / (weight * shares).sum().clamp_min(1.0) + 0.0 * total.sum()
+
+
+@torch.no_grad()
+def predict(net, planes, margin=32):
+    """Labels of a whole scan, closed across azimuth 0 like the C++ code does."""
+    rows, cols = planes.shape[1:]
+    width = -(-(cols + 2 * margin) // 64) * 64
+    canvas = np.zeros((1, PLANES, rows, width), np.float32)
+    canvas[0, :, :, :cols + 2 * margin] = planes[:, :, np.arange(-margin, cols + margin) % cols]
+    device = next(net.parameters()).device
+    logits = net(torch.from_numpy(canvas).to(device))[0, :, :, margin:margin + cols]
+    return logits.argmax(0).cpu().numpy()
+
+
+def evaluate(net, data, indices=None):
+    """Scores per kind of scene and over all: wood IoU, accuracy, wood recall (and beyond 8 m)."""
+    net.eval()
+    sums = {}
+    for i in (range(data.count) if indices is None else indices):
+        planes = data.planes[i].astype(np.float32)
+        label = predict(net, planes)
+        truth = data.labels[i]
+        valid = truth != IGNORE
+        far = 4.0 * np.exp2(2.0 * planes[RANGE]) > 8.0
+        wood, guess = (truth == WOOD) & valid, (label == WOOD) & valid
+        row = np.array([(wood & guess).sum(), (wood | guess).sum(), ((label == truth) & valid).sum(),
+                        valid.sum(), wood.sum(), (wood & guess & far).sum(), (wood & far).sum(),
+                        guess.sum()], float)
+        for key in ("all", data.meta["scans"][i]["kind"]):
+            sums[key] = sums.get(key, 0) + row
+    scores = {}
+    for key, s in sums.items():
+        def ratio(a, b):
+            return round(float(s[a] / s[b]), 4) if s[b] > 0 else None
+        scores[key] = {"wood_iou": ratio(0, 1), "accuracy": ratio(2, 3), "wood_recall": ratio(0, 4),
+                       "wood_precision": ratio(0, 7), "wood_recall_beyond_8m": ratio(5, 6)}
+    return scores
+
+
+# ---------------------------------------------------------------------------------------------
+# Training
+# ---------------------------------------------------------------------------------------------
+class Average:
+    """Exponential moving average of the weights: less noise at the end of a short training."""
+
+    def __init__(self, net, decay):
+        self.decay, self.steps = decay, 0
+        self.state = {k: v.detach().clone() for k, v in net.state_dict().items()}
+
+    def update(self, net):
+        self.steps += 1
+        decay = min(self.decay, (1 + self.steps) / (10 + self.steps))
+        for k, v in net.state_dict().items():
+            if v.dtype.is_floating_point:
+                self.state[k].mul_(decay).add_(v.detach(), alpha=1 - decay)
+            else:
+                self.state[k].copy_(v)
+
+
+def freeze_encoder(net, frozen):
+    for module in net.encoder_modules():
+        module.requires_grad_(not frozen)
+        if frozen:
+            module.eval()
+
+
+def train(args):
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    training, held_out = Dataset(args.data / "train"), Dataset(args.data / "held_out")
+    net = ErfNet(args.layers).to(device)
+    phases = [("encoder", args.encoder_epochs), ("decoder", args.decoder_epochs),
+              ("joint", args.joint_epochs)]
+    total = sum(n for _, n in phases)
+    state = {"epoch": 0, "best": -1.0, "best_state": None, "log": [], "seconds": 0.0, "stale": 0}
+    checkpoint = args.data / args.checkpoint
+    optimizer = average = None
+    if args.resume and checkpoint.exists():
+        saved = torch.load(checkpoint, map_location=device)
+        if saved["layers"] != args.layers:
+            raise SystemExit("train_segmentation: the checkpoint is of another architecture")
+        state = saved["state"]
+        net.load_state_dict(saved["net"])
+        print(f"resumed after epoch {state['epoch']} of {total}, best {state['best']:.4f}", flush=True)
+    else:
+        saved = None
+    picture = list(range(0, held_out.count, max(1, held_out.count // args.held_out_scans)))
+    while state["epoch"] < total and state["stale"] < args.patience:
+        epoch = state["epoch"]
+        begin = 0
+        for phase, length in phases:
+            if epoch < begin + length:
+                break
+            begin += length
+        if epoch == begin or optimizer is None:
+            freeze_encoder(net, phase == "decoder")
+            parameters = [p for p in net.parameters() if p.requires_grad]
+            optimizer = torch.optim.AdamW(parameters, lr=1e-3, weight_decay=1e-3)
+            average = Average(net, 0.995)
+            if saved is not None and epoch != begin:
+                optimizer.load_state_dict(saved["optimizer"])
+                average.state, average.steps = saved["average"], saved["average_steps"]
+            saved = None
+        # Data and drop-out of an epoch depend on the seed and its number only: resuming is exact.
+        rng = np.random.default_rng([args.seed, epoch])
+        torch.manual_seed(args.seed * 10007 + epoch)
+        peak = {"encoder": 2e-3, "decoder": 2e-3, "joint": args.joint_rate}[phase]
+        net.train()
+        freeze_encoder(net, phase == "decoder")
+        started, losses = time.time(), []
+        for step, (x, y) in enumerate(batches(training, rng, args.steps, args.batch, args.width)):
+            progress = (epoch - begin + step / args.steps) / length
+            warm = min(1.0, (progress * length * args.steps + 1) / 100.0)
+            rate = peak * warm * (0.5 + 0.5 * np.cos(np.pi * progress)) + 1e-5
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            x, y = x.to(device), y.to(device)
+            loss = coarse_loss(net.coarse(x), y) if phase == "encoder" else fine_loss(net(x), y)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+            optimizer.step()
+            average.update(net)
+            losses.append(float(loss.detach()))
+        state["seconds"] += time.time() - started
+        state["epoch"] += 1
+        line = {"epoch": state["epoch"], "phase": phase, "loss": round(float(np.mean(losses)), 4),
+                "minutes": round(state["seconds"] / 60, 1)}
+        if phase != "encoder" and (state["epoch"] % args.score_every == 0 or state["epoch"] == total):
+            smooth = ErfNet(args.layers).to(device)
+            smooth.load_state_dict(average.state)
+            line.update(evaluate(smooth, held_out, picture)["all"])
+            if line["wood_iou"] > state["best"]:
+                state.update(best=line["wood_iou"], stale=0,
+                             best_state={k: v.clone() for k, v in average.state.items()})
+            elif phase == "joint":
+                state["stale"] += 1
+        state["log"].append(line)
+        print(f"[{state['epoch']}/{total}] " + " ".join(f"{k}={v}" for k, v in line.items()
+                                                        if k != "epoch"), flush=True)
+        ended = state["epoch"] == begin + length
+        if ended and phase == "encoder":
+            net.load_state_dict(average.state)
+        temporary = checkpoint.with_suffix(".tmp")
+        torch.save({"layers": args.layers, "net": net.state_dict(), "state": state,
+                    "optimizer": optimizer.state_dict(), "average": average.state,
+                    "average_steps": average.steps}, temporary)
+        os.replace(temporary, checkpoint)
+        if args.minutes and state["seconds"] > 60 * args.minutes:
+            print("time is up; --resume goes on", flush=True)
+            break
+    best = ErfNet(args.layers)
+    best.load_state_dict(state["best_state"])
+    best.eval()
+    write_safetensors(args.output, *best.export())
+    scores = evaluate(load_exported(args.output), held_out)
+    write_card(args, training, held_out, best, state, scores)
+    print(json.dumps(scores, indent=1))
+
+
+def write_card(args, training, held_out, net, state, scores):
+    parameters = sum(v.size for v in net.export()[0].values())
+    kinds = sorted(k for k in scores if k != "all")
+
+    def show(value):
+        return "-" if value is None else f"{value:.4f}"
+
+    columns = ["wood_iou", "accuracy", "wood_recall", "wood_precision", "wood_recall_beyond_8m"]
+    table = ["| held-out scans | " + " | ".join(c.replace("_", " ") for c in columns) + " |",
+             "|---" * (len(columns) + 1) + "|"]
+    for key in ["all"] + kinds:
+        table.append(f"| {key} | " + " | ".join(show(scores[key][c]) for c in columns) + " |")
+    phases = {}
+    for line in state["log"]:
+        phases[line["phase"]] = phases.get(line["phase"], 0) + 1
+    text = f"""# Model card: {args.output.name}
+
+Wood, ground, leaf and other in a VLP-16 range image. Written by `scripts/train_segmentation.py`.
+
+- Date: {datetime.date.today().isoformat()}
+- Command: `scripts/train_segmentation.py {' '.join(args.command)}`
+- Layers: `{args.layers}`
+- Parameters: {parameters} (32-bit floats, batch normalisation folded), {args.output.stat().st_size / 1e6:.2f} MB
+- Input: {PLANES} planes, see `include/dendro_slam/segmentation/network_input.h`
+- Data: simulated only, {training.count} scans to train (seed {training.meta['seed']}), {held_out.count}
+  held out (seed {held_out.meta['seed']}, other scenes), {training.rows} x {training.cols}, by `simulate_training_scans`
+- Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.batch} crops
+  {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
+  {state['seconds'] / 60:.0f} min on {args.threads} CPU core(s) or a GPU
+- Augmentation: yaw (place of the crop), mirror, range scale, drop-out, intensity gain and off, ground unknown
+- Early stopping: the weights with the best wood IoU on a part of the held-out scans ({state['best']:.4f})
+
+## Scores per pixel, mixed pixels and all
+
+{chr(10).join(table)}
+
+## Limits
+
+No real scan was used. Reflectivities are drawn at random, so intensity is a weak hint only. The
+simulator's leaves are discs and its bark is smooth. Poles and posts look like wood.
+"""
+    args.output.with_suffix(".md").write_text(text)
+
+
+def write_fixture(folder, seed=7):
+    torch.manual_seed(seed)
+    net = ErfNet(FIXTURE_LAYERS)
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.normal_(0, 0.3)
+            module.running_var.uniform_(0.5, 1.5)
+            nn.init.uniform_(module.weight, 0.7, 1.3)
+            nn.init.normal_(module.bias, 0, 0.2)
+    net.eval()
+    x = torch.randn(1, PLANES, 16, 64)
+    with torch.no_grad():
+        logits = net(x)
+    write_safetensors(folder / "erfnet_fixture.safetensors", *net.export())
+    write_safetensors(folder / "erfnet_fixture_io.safetensors",
+                      {"input": x[0].numpy(), "logits": logits[0].numpy()})
+
+
+def simulate(args):
+    program = ROOT / "build/devel/lib/dendro_slam/simulate_training_scans"
+    if not program.exists():
+        raise SystemExit("train_segmentation: build first (scripts/build simulate_training_scans)")
+    for name, count, seed in (("train", args.train_scans, 1000), ("held_out", args.test_scans, 900000)):
+        if not (args.data / name / "meta.json").exists():
+            subprocess.run([str(program), "-o", str(args.data / name), "--scans", str(count),
+                            "--seed", str(seed)], check=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=pathlib.Path, default=ROOT / "output/segmentation_data",
+                        help="folder of the simulated scans and the checkpoint")
+    parser.add_argument("--output", type=pathlib.Path,
+                        default=ROOT / "config/models/erfnet_wood.safetensors")
+    parser.add_argument("--train-scans", type=int, default=900)
+    parser.add_argument("--test-scans", type=int, default=120)
+    parser.add_argument("--held-out-scans", type=int, default=40, help="scored during the training")
+    parser.add_argument("--layers", default=LAYERS)
+    parser.add_argument("--encoder-epochs", type=int, default=6)
+    parser.add_argument("--decoder-epochs", type=int, default=6)
+    parser.add_argument("--joint-epochs", type=int, default=60)
+    parser.add_argument("--joint-rate", type=float, default=2e-3, help="peak learning rate of the joint step")
+    parser.add_argument("--steps", type=int, default=150, help="per epoch")
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--width", type=int, default=320, help="columns of a crop, a multiple of 8")
+    parser.add_argument("--score-every", type=int, default=3, help="epochs")
+    parser.add_argument("--patience", type=int, default=12, help="scores without a better one")
+    parser.add_argument("--minutes", type=float, default=0, help="stop after this long, 0: never")
+    parser.add_argument("--threads", type=int, default=max(1, os.cpu_count() or 1))
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--checkpoint", default="checkpoint.pt")
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--evaluate", type=pathlib.Path, metavar="FILE")
+    parser.add_argument("--fixture", type=pathlib.Path, metavar="DIR")
+    args = parser.parse_args()
+    args.command = sys.argv[1:]
+    if args.fixture:
+        write_fixture(args.fixture)
+        return
+    simulate(args)
+    if args.evaluate:
+        torch.set_num_threads(args.threads)
+        print(json.dumps(evaluate(load_exported(args.evaluate), Dataset(args.data / "held_out")), indent=1))
+        return
+    train(args)
+
+
+if __name__ == "__main__":
+    main()
