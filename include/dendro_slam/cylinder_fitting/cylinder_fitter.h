@@ -25,14 +25,15 @@ struct CylinderFitterConfig {
   double range_sigma_weight = 8.0;    ///< Worth of that expectation, in returns. >= 0.
   double taper_sigma_m_per_m = 0.02;  ///< Prior of dr/ds [m/m]. > 0.
 
-  double beam_exit_horizontal_m = 0.0127;      ///< Width of the beam as it leaves [m]. >= 0.
-  double beam_exit_vertical_m = 0.0095;        ///< Height of the beam as it leaves [m]. >= 0.
+  double beam_exit_horizontal_m = 0.0095;      ///< Width of the beam as it leaves [m]. >= 0.
+  double beam_exit_vertical_m = 0.0127;        ///< Height of the beam as it leaves [m]. >= 0.
   double beam_divergence_horizontal_rad = 3.0e-3;  ///< Full divergence in azimuth [rad]. >= 0.
   double beam_divergence_vertical_rad = 1.5e-3;    ///< Full divergence in elevation [rad]. >= 0.
-  double detection_fraction = 0.2;   ///< Share of the beam that makes a return. (0, 1).
-  double competing_fraction = 0.5;   ///< Share to win against a surface behind. (0, 1).
-  double edge_sigma_m = 0.001;       ///< What the silhouette model leaves unknown, per edge [m]. > 0.
-  double edge_bias_sigma_m = 0.0005; ///< The same, common to all edges of a segment [m]. > 0.
+  double detection_fraction = 0.2;  ///< Energy that makes a return, of a full head-on hit. (0, 1).
+  double echo_separation_m = 0.76;  ///< Surfaces nearer to each other give one mixed return [m]. >= 0.
+  double edge_sigma_m = 0.0015;     ///< What the silhouette model leaves unknown, per edge [m]. > 0.
+  double edge_bias_sigma_m = 0.0007; ///< The same, common to all edges of a segment [m]. > 0.
+  double ring_bias_sigma_m = 0.0;   ///< Offset of a laser's ranges against the others' [m]. >= 0.
 
   template <class Visitor>
   void Visit(Visitor&& v) {
@@ -53,9 +54,10 @@ struct CylinderFitterConfig {
     v("beam_divergence_horizontal_rad", beam_divergence_horizontal_rad);
     v("beam_divergence_vertical_rad", beam_divergence_vertical_rad);
     v("detection_fraction", detection_fraction);
-    v("competing_fraction", competing_fraction);
+    v("echo_separation_m", echo_separation_m);
     v("edge_sigma_m", edge_sigma_m);
     v("edge_bias_sigma_m", edge_bias_sigma_m);
+    v("ring_bias_sigma_m", ring_bias_sigma_m);
   }
 
   /// @throws std::invalid_argument naming the field that is out of its range.

@@ -1,0 +1,272 @@
+#include "dendro_slam/cylinder_fitting/beam_model.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+
+#include "dendro_slam/geometry/cylinder.h"
+#include "dendro_slam/geometry/so3.h"
+
+namespace dendro {
+namespace {
+
+constexpr double kThinRay = 1e-6;
+
+// Gauss-Legendre on [-1, 1], 8 nodes.
+constexpr std::array<double, 8> kNode = {-0.9602898564975363, -0.7966664774136267,
+                                         -0.5255324099163290, -0.1834346424956498,
+                                         0.1834346424956498,  0.5255324099163290,
+                                         0.7966664774136267,  0.9602898564975363};
+constexpr std::array<double, 8> kWeight = {0.1012285362903763, 0.2223810344533745,
+                                           0.3137066458778873, 0.3626837833783620,
+                                           0.3626837833783620, 0.3137066458778873,
+                                           0.2223810344533745, 0.1012285362903763};
+
+// Energy density of the projected rectangle, not normalised (1 at the centre).
+double Density(double u, const Footprint& footprint) {
+  const double inner = footprint.half_width_m - footprint.half_slope_m;
+  const double distance = std::abs(u);
+  if (distance <= inner) return 1.0;
+  const double fall = 2.0 * footprint.half_slope_m;
+  return fall > 0.0 ? std::max(0.0, (footprint.reach() - distance) / fall) : 0.0;
+}
+
+// Integrals over the part of the footprint within the silhouette; y' = y + u is a ray's offset and
+// g = sqrt(Y^2 - y'^2) both its depth and, over Y, its cosine of incidence.
+struct LimbIntegrals {
+  double energy = 0.0, energy_y = 0.0, energy_Y = 0.0;  // of w g
+  double depth = 0.0, depth_y = 0.0, depth_Y = 0.0;     // of w g^2
+  double shift = 0.0, shift_y = 0.0, shift_Y = 0.0;     // of w g u
+  double share = 0.0;                                   // of w
+};
+
+LimbIntegrals Integrate(double y, double Y, const Footprint& footprint) {
+  LimbIntegrals sum;
+  const double reach = footprint.reach();
+  // `slice` is the slice's width over g, which stays finite at the limb.
+  const auto add = [&](double y_ray, double g, double slice) {
+    const double u = y_ray - y;
+    const double w = Density(u, footprint) * slice;
+    const double wg = w * g;
+    sum.share += wg;
+    sum.energy += wg * g;
+    sum.energy_y -= w * y_ray;
+    sum.energy_Y += w * Y;
+    sum.depth += wg * g * g;
+    sum.depth_y -= 2.0 * wg * y_ray;
+    sum.depth_Y += 2.0 * wg * Y;
+    sum.shift += wg * g * u;
+    sum.shift_y -= w * u * y_ray;
+    sum.shift_Y += w * u * Y;
+  };
+  if (std::abs(y) + reach < 0.9 * Y) {
+    for (std::size_t i = 0; i < kNode.size(); ++i) {
+      const double y_ray = y + reach * kNode[i];
+      const double g = std::sqrt(Y * Y - y_ray * y_ray);
+      add(y_ray, g, reach * kWeight[i] / g);
+    }
+    return sum;
+  }
+  const double low = std::max(-1.0, (y - reach) / Y);
+  const double high = std::min(1.0, (y + reach) / Y);
+  if (low >= high) return sum;
+  // y' = Y sin(theta) takes the square-root singularity of the limb out of the integrals.
+  const double theta_low = std::asin(low);
+  const double theta_high = std::asin(high);
+  const double half = 0.5 * (theta_high - theta_low);
+  const double middle = 0.5 * (theta_high + theta_low);
+  for (std::size_t i = 0; i < kNode.size(); ++i) {
+    const double sine = std::sin(middle + half * kNode[i]);
+    add(Y * sine, Y * std::sqrt(std::max(0.0, 1.0 - sine * sine)), half * kWeight[i]);
+  }
+  return sum;
+}
+
+}  // namespace
+
+Cone Cone::Retract(const Vector6d& delta) const {
+  const Eigen::Matrix<double, 3, 2> B = PerpendicularBasis(axis);
+  Cone out;
+  out.axis = (ExpSo3(B * delta.head<2>()) * axis).normalized();
+  out.point = point + B * delta.segment<2>(2);
+  out.radius = radius + delta[4];
+  out.slope = slope + delta[5];
+  return out;
+}
+
+Footprint FootprintOnCone(const Eigen::Vector3d& axis,
+                          const Eigen::Vector3d& direction,
+                          const Eigen::Vector3d& spin_axis,
+                          double half_horizontal_m,
+                          double half_vertical_m) {
+  const double c = axis.dot(direction);
+  const double m2 = 1.0 - c * c;
+  const Eigen::Vector3d across = spin_axis.cross(direction);
+  const double across_norm = across.norm();
+  Footprint footprint;
+  if (m2 < 1e-6 || across_norm < 1e-6) {
+    footprint.half_width_m = std::max(half_horizontal_m, half_vertical_m);
+    return footprint;
+  }
+  const double m = std::sqrt(m2);
+  const Eigen::Vector3d horizontal = across / across_norm;
+  const Eigen::Vector3d vertical = direction.cross(horizontal);
+  const Eigen::Vector3d u = axis.cross(direction) / m;
+  const Eigen::Vector3d v = (axis - c * direction) / m;
+  const double uh = std::abs(u.dot(horizontal)) * half_horizontal_m;
+  const double uv = std::abs(u.dot(vertical)) * half_vertical_m;
+  footprint.half_width_m = std::max(uh, uv);
+  footprint.half_slope_m = std::min(uh, uv);
+  // E[v | u] ~ (cov_uv / cov_uu) u; v metres along the axis' image lengthen the range by
+  // v cot(angle between beam and axis).
+  const double hh = half_horizontal_m * half_horizontal_m;
+  const double vv = half_vertical_m * half_vertical_m;
+  const double covariance = hh * u.dot(horizontal) * v.dot(horizontal) +
+                            vv * u.dot(vertical) * v.dot(vertical);
+  const double variance = uh * uh + uv * uv;
+  if (variance > 0.0) footprint.skew = covariance / variance * c / m;
+  return footprint;
+}
+
+BeamOnCone LocateBeam(const Cone& cone,
+                      const Eigen::Vector3d& origin,
+                      const Eigen::Vector3d& direction) {
+  const Eigen::Matrix<double, 3, 2> basis = PerpendicularBasis(cone.axis);
+  const Eigen::Vector3d& a = cone.axis;
+  const Eigen::Vector3d& d = direction;
+  const Eigen::Vector3d v = origin - cone.point;
+  const double k = cone.slope;
+  const double s0 = v.dot(a);
+  const double c = d.dot(a);
+  const double R0 = cone.radius + k * s0;
+  const double A = 1.0 - c * c - k * k * c * c;
+  const double B = v.dot(d) - s0 * c - k * c * R0;
+  const double C = v.squaredNorm() - s0 * s0 - R0 * R0;
+  const double m2 = 1.0 - c * c;
+  BeamOnCone out;
+  if (!(A > 1e-6) || !(m2 > 1e-6)) return out;
+  const double m = std::sqrt(m2);
+  const Eigen::Vector3d axd = a.cross(d);
+  const double y = v.dot(axd) / m;
+  const double Y2 = y * y + B * B / A - C;
+  if (!(Y2 > 1e-12)) return out;
+  const double Y = std::sqrt(Y2);
+
+  // Turning the axis: da = (B alpha) x a = alpha_1 (b1 x a) + alpha_2 (b2 x a) = -alpha_1 b2 + alpha_2 b1.
+  Eigen::Matrix<double, 3, 2> da;
+  da.col(0) = -basis.col(1);
+  da.col(1) = basis.col(0);
+  Vector6d ds0 = Vector6d::Zero(), dc = Vector6d::Zero(), dR0 = Vector6d::Zero();
+  ds0.head<2>() = da.transpose() * v;
+  dc.head<2>() = da.transpose() * d;
+  dR0 = k * ds0;
+  dR0[4] += 1.0;
+  dR0[5] += s0;
+  Vector6d dA = -2.0 * c * (1.0 + k * k) * dc;
+  dA[5] -= 2.0 * k * c * c;
+  Vector6d dB = -c * ds0 - s0 * dc - k * c * dR0 - R0 * k * dc;
+  dB.segment<2>(2) -= basis.transpose() * d;
+  dB[5] -= R0 * c;
+  Vector6d dC = -2.0 * s0 * ds0 - 2.0 * R0 * dR0;
+  dC.segment<2>(2) -= 2.0 * basis.transpose() * v;
+  // y = N / m with N = v . (a x d).
+  Vector6d dN = Vector6d::Zero();
+  dN.head<2>() = da.transpose() * d.cross(v);
+  dN.segment<2>(2) = -basis.transpose() * axd;
+  const Vector6d dm = -c / m * dc;
+
+  out.valid = true;
+  out.offset = y;
+  out.silhouette = Y;
+  out.mid_range = -B / A;
+  out.sin_angle = std::sqrt(A);
+  out.d_offset = (dN - y * dm) / m;
+  out.d_silhouette =
+      (y * out.d_offset + (B / A) * dB - 0.5 * B * B / (A * A) * dA - 0.5 * dC) / Y;
+  out.d_mid_range = -dB / A + B / (A * A) * dA;
+  out.d_sin_angle = 0.5 / out.sin_angle * dA;
+  return out;
+}
+
+RangePrediction PredictRange(const BeamOnCone& beam, const Footprint& footprint) {
+  const double y = beam.offset;
+  const double Y = beam.silhouette;
+  RangePrediction out;
+  double depth = 0.0, depth_y = 0.0, depth_Y = 0.0;
+  double shift = 0.0, shift_y = 0.0, shift_Y = 0.0;
+  if (footprint.reach() < kThinRay) {
+    if (std::abs(y) < Y) {
+      depth = std::sqrt(Y * Y - y * y);
+      const double inverse = 1.0 / std::max(depth, 1e-3 * Y);
+      depth_y = -y * inverse;
+      depth_Y = Y * inverse;
+      out.energy = beam.sin_angle * depth / Y;
+    }
+  } else {
+    const LimbIntegrals sum = Integrate(y, Y, footprint);
+    if (sum.energy > 1e-9 * Y * footprint.reach()) {
+      const double inverse = 1.0 / sum.energy;
+      depth = sum.depth * inverse;
+      depth_y = (sum.depth_y - depth * sum.energy_y) * inverse;
+      depth_Y = (sum.depth_Y - depth * sum.energy_Y) * inverse;
+      shift = sum.shift * inverse;
+      shift_y = (sum.shift_y - shift * sum.energy_y) * inverse;
+      shift_Y = (sum.shift_Y - shift * sum.energy_Y) * inverse;
+      out.energy = beam.sin_angle * sum.energy / (Y * 2.0 * footprint.half_width_m);
+    }
+  }
+  const double inverse = 1.0 / beam.sin_angle;
+  out.range = beam.mid_range - depth * inverse + footprint.skew * shift;
+  out.jacobian = beam.d_mid_range + depth * inverse * inverse * beam.d_sin_angle +
+                 (footprint.skew * shift_y - depth_y * inverse) * beam.d_offset +
+                 (footprint.skew * shift_Y - depth_Y * inverse) * beam.d_silhouette;
+  return out;
+}
+
+double DetectionOffset(double silhouette,
+                       double sin_angle,
+                       const Footprint& footprint,
+                       double energy,
+                       double competing,
+                       double* d_silhouette) {
+  const double Y = silhouette;
+  if (d_silhouette != nullptr) *d_silhouette = 1.0;
+  if (footprint.reach() < kThinRay) return Y;
+  const double area = 2.0 * footprint.half_width_m;
+  const double scale = sin_angle / (Y * area);
+  // What a beam at an offset gets from the cone less what it needs, and whether the surface behind
+  // sets that need.
+  const auto excess = [&](const LimbIntegrals& sum, bool* behind) {
+    const double rest = competing * (1.0 - sum.share / area);
+    *behind = rest > energy;
+    return scale * sum.energy - std::max(energy, rest);
+  };
+  bool behind = false;
+  LimbIntegrals sum = Integrate(0.0, Y, footprint);
+  if (excess(sum, &behind) <= 0.0) {
+    if (d_silhouette != nullptr) *d_silhouette = 0.0;
+    return 0.0;
+  }
+  // Newton within a shrinking bracket: the excess falls with the offset.
+  double low = 0.0;
+  double high = Y + footprint.reach();
+  double e = Y;
+  for (int i = 0; i < 50; ++i) {
+    sum = Integrate(e, Y, footprint);
+    const double value = excess(sum, &behind);
+    (value > 0.0 ? low : high) = e;
+    double slope = scale * sum.energy_y;
+    if (behind) slope -= competing * Density(Y - e, footprint) / area;
+    double next = slope < 0.0 ? e - value / slope : low;
+    if (!(next > low && next < high)) next = 0.5 * (low + high);
+    const bool done = std::abs(next - e) < 1e-7;
+    e = next;
+    if (done) break;
+  }
+  if (d_silhouette != nullptr && sum.energy_y < 0.0 && !behind) {
+    *d_silhouette = -(sum.energy_Y - sum.energy / Y) / sum.energy_y;
+  }
+  return e;
+}
+
+}  // namespace dendro

@@ -1,0 +1,744 @@
+#include "dendro_slam/cylinder_fitting/cylinder_fitter.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <stdexcept>
+#include <string>
+
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+
+#include "dendro_slam/cylinder_fitting/beam_model.h"
+#include "dendro_slam/cylinder_fitting/marshall_fit.h"
+
+namespace dendro {
+namespace {
+
+constexpr double kDegree = 0.017453292519943295;
+constexpr int kMaxIterations = 15;
+
+// The state of the final estimator: the cone's tangent space and the error common to all edges.
+constexpr int kStates = 7;
+constexpr int kRadius = 4;
+constexpr int kSlope = 5;
+constexpr int kEdgeBias = 6;
+using Vector7d = Eigen::Matrix<double, kStates, 1>;
+using Matrix7d = Eigen::Matrix<double, kStates, kStates>;
+
+void Require(bool ok, const char* field, const char* rule) {
+  if (!ok) {
+    throw std::invalid_argument(std::string("CylinderFitterConfig.") + field + " must be " + rule);
+  }
+}
+
+struct Beam {
+  Eigen::Vector3d origin, direction, point;
+  double range = 0.0;
+  double half_horizontal = 0.0, half_vertical = 0.0;  // Footprint at the surface.
+  int row = 0;
+};
+
+// A silhouette crossing: a beam that hit and its neighbour that missed.
+struct Edge {
+  Beam hit, miss;
+  double competing = 0.0;  // See DetectionOffset.
+};
+
+// A linear observation `low <= g . x <= high` of the state, known to sigma.
+struct Interval {
+  Vector7d g;
+  double low, high;
+  // Gaussian message of expectation propagation, in natural parameters of g . x.
+  double precision = 0.0, shift = 0.0;
+};
+
+struct Posterior {
+  Vector7d mean = Vector7d::Zero();
+  Matrix7d covariance = Matrix7d::Identity();
+};
+
+double NormalPdf(double x) { return 0.3989422804014327 * std::exp(-0.5 * x * x); }
+double NormalCdf(double x) { return 0.5 * std::erfc(-x * 0.7071067811865476); }
+
+// Gaussian times intervals, by expectation propagation: every interval is replaced by the Gaussian
+// that has the same moments in the company of all others. Brackets that coincide (a vertical
+// trunk's edges in neighbouring rings) so count once, and brackets that are staggered narrow each
+// other down, which treating each as an independent error of spacing/sqrt(12) would get wrong both
+// ways. An interval may be false (a leaf, a knot) with probability `outlier`.
+Posterior Propagate(const Matrix7d& information,
+                    const Vector7d& vector,
+                    double sigma,
+                    double outlier,
+                    std::vector<Interval>* intervals) {
+  Posterior out;
+  out.covariance = information.ldlt().solve(Matrix7d::Identity());
+  out.mean = out.covariance * vector;
+  if (intervals->empty()) return out;
+  const double noise = sigma * sigma;
+  for (Interval& i : *intervals) i.precision = i.shift = 0.0;
+  Matrix7d precision = information;
+  Vector7d natural = vector;
+  for (int sweep = 0; sweep < 12; ++sweep) {
+    double change = 0.0;
+    for (Interval& i : *intervals) {
+      const Vector7d Cg = out.covariance * i.g;
+      const double v = i.g.dot(Cg);
+      const double m = i.g.dot(out.mean);
+      const double cavity_precision = 1.0 / v - i.precision;
+      if (!(cavity_precision > 1e-9 / v)) continue;
+      const double vc = 1.0 / cavity_precision;
+      const double mc = vc * (m / v - i.shift);
+      // Moments of the noisy edge within the bracket, then of the edge itself.
+      const double total = vc + noise;
+      const double s = std::sqrt(total);
+      const double a = (i.low - mc) / s;
+      const double b = (i.high - mc) / s;
+      const double inside = NormalCdf(b) - NormalCdf(a);
+      double mean = mc, variance = vc;
+      const double mass = (1.0 - outlier) * inside;
+      if (mass > 1e-12) {
+        const double pa = NormalPdf(a), pb = NormalPdf(b);
+        const double first = (pa - pb) / inside;
+        const double second = 1.0 + (a * pa - b * pb) / inside - first * first;
+        const double gain = vc / total;
+        const double box_mean = mc + gain * s * first;
+        const double box_variance = vc - gain * vc * (1.0 - std::max(0.0, second));
+        const double w = mass / (mass + outlier);
+        mean = w * box_mean + (1.0 - w) * mc;
+        variance = w * (box_variance + (box_mean - mean) * (box_mean - mean)) +
+                   (1.0 - w) * (vc + (mc - mean) * (mc - mean));
+      }
+      const double precision_new = std::max(0.0, 1.0 / variance - cavity_precision);
+      const double shift_new = precision_new > 0.0 ? mean * (precision_new + cavity_precision) -
+                                                         mc * cavity_precision
+                                                   : 0.0;
+      const double d_precision = 0.8 * (precision_new - i.precision);
+      const double d_shift = 0.8 * (shift_new - i.shift);
+      const double denominator = 1.0 + d_precision * v;
+      if (!(denominator > 1e-9)) continue;
+      i.precision += d_precision;
+      i.shift += d_shift;
+      out.mean += Cg * ((d_shift - d_precision * m) / denominator);
+      out.covariance -= Cg * Cg.transpose() * (d_precision / denominator);
+      change = std::max(change, std::abs(d_precision) * v);
+    }
+    // Rank-one updates drift; start the next sweep from the sums.
+    precision = information;
+    natural = vector;
+    for (const Interval& i : *intervals) {
+      precision += i.precision * i.g * i.g.transpose();
+      natural += i.shift * i.g;
+    }
+    out.covariance = precision.ldlt().solve(Matrix7d::Identity());
+    out.mean = out.covariance * natural;
+    if (change < 1e-4) break;
+  }
+  return out;
+}
+
+struct Estimate {
+  Cone cone;
+  double edge_bias = 0.0;
+  Matrix7d covariance = Matrix7d::Identity();
+  std::vector<double> weights;  // Per beam.
+  std::vector<double> residuals;
+  double sigma = 0.0;           // Scatter along the beam [m].
+  int edges = 0, edges_violated = 0;
+  bool converged = false;
+};
+
+double Median(std::vector<double> values) {
+  if (values.empty()) return 0.0;
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// Full weight near, none far: a leaf is not a large error of a trunk.
+double RobustWeight(double ratio) {
+  constexpr double kFull = 2.5, kNone = 5.0;
+  const double x = std::abs(ratio);
+  if (x <= kFull) return 1.0;
+  if (x >= kNone) return 0.0;
+  return 0.5 * (1.0 + std::cos(M_PI * (x - kFull) / (kNone - kFull)));
+}
+
+class SegmentFit {
+ public:
+  SegmentFit(const LabelledScan& scan, const Segment& segment, const CylinderFitterConfig& config)
+      : image_(scan.image), segment_(segment), config_(config) {}
+
+  FittedCylinder Fit();
+
+ private:
+  bool Collect();
+  void CollectEdges();
+  void TryEdge(std::size_t pixel, int row, int col, int d_row, int d_col);
+  bool InSegment(std::size_t pixel) const {
+    return std::binary_search(segment_.pixels.begin(), segment_.pixels.end(),
+                              static_cast<std::int32_t>(pixel));
+  }
+  Beam BeamAt(std::size_t pixel, double range) const;
+  Cone StartFrom(const Eigen::Vector3d& axis, double* cost) const;
+  std::optional<Cone> Start() const;
+  Footprint FootprintOf(const Cone& cone, const Beam& beam) const {
+    return FootprintOnCone(cone.axis, beam.direction, Eigen::Vector3d::UnitZ(),
+                           beam.half_horizontal, beam.half_vertical);
+  }
+  void Recentre(Cone* cone, const std::vector<double>& weights) const;
+  void Linearise(Estimate* estimate,
+                 bool rescale,
+                 Matrix7d* information,
+                 Vector7d* vector,
+                 std::vector<Interval>* intervals) const;
+  Estimate Refine(const Cone& start) const;
+  void Report(const Estimate& estimate, FittedCylinder* out) const;
+
+  const RangeImage& image_;
+  const Segment& segment_;
+  const CylinderFitterConfig& config_;
+  std::vector<Beam> beams_;
+  std::vector<Edge> edges_;
+  Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();  // Mean optical centre.
+  Eigen::Vector3d centroid_ = Eigen::Vector3d::Zero();
+  double bright_ = 0.0;  // Intensity of a full hit.
+  int num_rings_ = 0;
+  int non_finite_ = 0;
+};
+
+Beam SegmentFit::BeamAt(std::size_t pixel, double range) const {
+  Beam beam;
+  beam.origin = image_.beam_origin[pixel].cast<double>();
+  beam.direction = image_.beam_direction[pixel].cast<double>();
+  beam.range = range;
+  beam.half_horizontal =
+      0.5 * (config_.beam_exit_horizontal_m + range * config_.beam_divergence_horizontal_rad);
+  beam.half_vertical =
+      0.5 * (config_.beam_exit_vertical_m + range * config_.beam_divergence_vertical_rad);
+  beam.row = static_cast<int>(pixel) / image_.cols;
+  return beam;
+}
+
+bool SegmentFit::Collect() {
+  std::vector<double> intensities;
+  int last_row = -1;
+  for (const std::int32_t index : segment_.pixels) {
+    const auto pixel = static_cast<std::size_t>(index);
+    const Eigen::Vector3f& p = image_.point[pixel];
+    const Eigen::Vector3f& o = image_.beam_origin[pixel];
+    if (!image_.HasReturn(pixel) || !p.allFinite() || !o.allFinite()) {
+      ++non_finite_;
+      continue;
+    }
+    const Eigen::Vector3d ray = (p - o).cast<double>();
+    const double range = ray.norm();
+    if (!(range > 1e-3) || !(range < 1e3)) {
+      ++non_finite_;
+      continue;
+    }
+    Beam beam = BeamAt(pixel, range);
+    beam.direction = ray / range;
+    beam.point = p.cast<double>();
+    if (beam.row != last_row) ++num_rings_;
+    last_row = beam.row;
+    beams_.push_back(beam);
+    centroid_ += beam.point;
+    origin_ += beam.origin;
+    if (image_.intensity.size() == image_.size()) {
+      intensities.push_back(static_cast<double>(image_.intensity[pixel]));
+    }
+  }
+  if (beams_.empty()) return false;
+  centroid_ /= static_cast<double>(beams_.size());
+  origin_ /= static_cast<double>(beams_.size());
+  if (!intensities.empty()) {
+    const auto upper =
+        intensities.begin() + static_cast<std::ptrdiff_t>(intensities.size() * 3 / 4);
+    std::nth_element(intensities.begin(), upper, intensities.end());
+    bright_ = *upper;
+  }
+  return true;
+}
+
+void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_col) {
+  const int next_row = row + d_row;
+  if (next_row < 0 || next_row >= image_.rows) return;
+  const std::size_t next = image_.Index(next_row, image_.WrapColumn(col + d_col));
+  if (InSegment(next)) return;
+  const int beyond_row = row + 2 * d_row;
+  if (beyond_row >= 0 && beyond_row < image_.rows &&
+      InSegment(image_.Index(beyond_row, image_.WrapColumn(col + 2 * d_col)))) {
+    return;  // A hole, not an edge.
+  }
+  if (!image_.beam_direction[next].allFinite() || !image_.beam_origin[next].allFinite()) return;
+  const double range =
+      static_cast<double>((image_.point[pixel] - image_.beam_origin[pixel]).norm());
+  Edge edge;
+  edge.hit = BeamAt(pixel, range);
+  edge.miss = BeamAt(next, range);
+  if (image_.HasReturn(next)) {
+    const double behind =
+        static_cast<double>((image_.point[next] - image_.beam_origin[next]).norm());
+    // A nearer surface hides the silhouette; one close behind mixes with it.
+    if (!(behind > range + std::max(config_.echo_separation_m, 6.0 * config_.range_sigma_m))) return;
+    const double brightness = image_.intensity.size() == image_.size()
+                                  ? static_cast<double>(image_.intensity[next])
+                                  : 0.0;
+    const double relative = brightness > 0.0 && bright_ > 0.0 ? brightness / bright_ : 1.0;
+    edge.competing = relative * range * range / (behind * behind);
+  }
+  edges_.push_back(edge);
+}
+
+void SegmentFit::CollectEdges() {
+  for (const std::int32_t index : segment_.pixels) {
+    const auto pixel = static_cast<std::size_t>(index);
+    if (!image_.HasReturn(pixel) || !image_.point[pixel].allFinite() ||
+        !image_.beam_direction[pixel].allFinite() || !image_.beam_origin[pixel].allFinite()) {
+      continue;
+    }
+    const int row = index / image_.cols;
+    const int col = index % image_.cols;
+    TryEdge(pixel, row, col, 0, -1);
+    TryEdge(pixel, row, col, 0, 1);
+    TryEdge(pixel, row, col, -1, 0);
+    TryEdge(pixel, row, col, 1, 0);
+  }
+}
+
+// A cone along an axis: the width across the view gives the radius, Marshall's fit the rest.
+Cone SegmentFit::StartFrom(const Eigen::Vector3d& axis, double* cost) const {
+  Eigen::Vector3d view = centroid_ - origin_;
+  view -= view.dot(axis) * axis;
+  const double distance = view.norm();
+  Cone cone;
+  cone.axis = axis;
+  cone.point = centroid_;
+  if (!(distance > 1e-3)) {
+    *cost = std::numeric_limits<double>::infinity();
+    return cone;
+  }
+  view /= distance;
+  const Eigen::Vector3d side = axis.cross(view);
+  std::vector<double> across;
+  across.reserve(beams_.size());
+  for (const Beam& b : beams_) across.push_back((b.point - centroid_).dot(side));
+  std::sort(across.begin(), across.end());
+  const std::size_t trim = across.size() / 20;
+  double half = 0.5 * (across[across.size() - 1 - trim] - across[trim]);
+  half = std::clamp(half, config_.min_radius_m, 0.8 * distance);
+  // The mean depth of a half circle seen from its side is pi/4 of its radius.
+  cone.radius = half;
+  cone.point = centroid_ + view * (0.785 * half) +
+               side * (0.5 * (across[across.size() - 1 - trim] + across[trim]));
+
+  std::vector<Eigen::Vector3d> points;
+  points.reserve(beams_.size());
+  for (const Beam& b : beams_) points.push_back(b.point);
+  const Cylinder first{cone.axis, cone.point, 1.0 / cone.radius};
+  std::optional<Cylinder> fit;
+  for (int pass = 0; pass < 2 && points.size() >= 6; ++pass) {
+    fit = FitMarshall(points, origin_, fit ? *fit : first);
+    if (!fit) break;
+    // Points far off are leaves or mixed returns: once more without them.
+    std::vector<double> distances;
+    for (const Eigen::Vector3d& p : points) distances.push_back(std::abs(fit->Distance(p)));
+    const double limit = std::max(4.0 * 1.4826 * Median(distances), 2.0 * config_.range_sigma_m);
+    std::vector<Eigen::Vector3d> near;
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      if (distances[i] <= limit) near.push_back(points[i]);
+    }
+    if (near.size() == points.size()) break;
+    points.swap(near);
+  }
+  const auto accept = [&](const Cylinder& c) {
+    const double r = c.radius();
+    return r > 0.4 * half && r < 4.0 * half + 0.05 && std::abs(c.axis.dot(axis)) > 0.7;
+  };
+  if (fit && (config_.marshall_only || accept(*fit))) {
+    cone.axis = fit->axis.dot(axis) < 0.0 ? Eigen::Vector3d(-fit->axis) : fit->axis;
+    cone.point = fit->point;
+    cone.radius = fit->radius();
+  }
+  const Cylinder c{cone.axis, cone.point, 1.0 / cone.radius};
+  std::vector<double> distances;
+  for (const Beam& b : beams_) distances.push_back(std::abs(c.Distance(b.point)));
+  *cost = Median(distances) + 0.01 * std::abs(std::log(cone.radius / half));
+  return cone;
+}
+
+std::optional<Cone> SegmentFit::Start() const {
+  // Ring centres: the mean of each ring's returns.
+  std::vector<Eigen::Vector3d> centres;
+  int count = 0;
+  for (std::size_t i = 0; i < beams_.size(); ++i) {
+    if (i == 0 || beams_[i].row != beams_[i - 1].row) {
+      if (count > 0) centres.back() /= count;
+      centres.push_back(Eigen::Vector3d::Zero());
+      count = 0;
+    }
+    centres.back() += beams_[i].point;
+    ++count;
+  }
+  centres.back() /= count;
+  const auto principal = [](const std::vector<Eigen::Vector3d>& points) {
+    Eigen::Vector3d mean = Eigen::Vector3d::Zero();
+    for (const Eigen::Vector3d& p : points) mean += p;
+    mean /= static_cast<double>(points.size());
+    Eigen::Matrix3d scatter = Eigen::Matrix3d::Zero();
+    for (const Eigen::Vector3d& p : points) scatter += (p - mean) * (p - mean).transpose();
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(scatter);
+    return Eigen::Vector3d(solver.eigenvectors().col(2));
+  };
+  std::vector<Eigen::Vector3d> all;
+  for (const Beam& b : beams_) all.push_back(b.point);
+  double cost_rings = 0.0, cost_all = 0.0;
+  const Cone rings = StartFrom(principal(centres), &cost_rings);
+  const Eigen::Vector3d major = principal(all);
+  // Two starts only where they differ: a trunk's rings point along it, a level branch's do not.
+  if (std::abs(major.dot(rings.axis)) > 0.9) {
+    return std::isfinite(cost_rings) ? std::optional<Cone>(rings) : std::nullopt;
+  }
+  const Cone along = StartFrom(major, &cost_all);
+  if (!std::isfinite(std::min(cost_rings, cost_all))) return std::nullopt;
+  return cost_rings <= cost_all ? rings : along;
+}
+
+// Moves the anchor to the middle of the stretch that holds the returns.
+void SegmentFit::Recentre(Cone* cone, const std::vector<double>& weights) const {
+  double low = std::numeric_limits<double>::infinity(), high = -low;
+  for (std::size_t i = 0; i < beams_.size(); ++i) {
+    if (!weights.empty() && weights[i] < 0.5) continue;
+    const double s = (beams_[i].point - cone->point).dot(cone->axis);
+    low = std::min(low, s);
+    high = std::max(high, s);
+  }
+  if (!(low <= high)) return;
+  const double s = 0.5 * (low + high);
+  cone->point += s * cone->axis;
+  cone->radius += s * cone->slope;
+}
+
+void SegmentFit::Linearise(Estimate* estimate,
+                           bool rescale,
+                           Matrix7d* information,
+                           Vector7d* vector,
+                           std::vector<Interval>* intervals) const {
+  const Cone& cone = estimate->cone;
+  const std::size_t n = beams_.size();
+  std::vector<Vector6d> jacobians(n);
+  estimate->residuals.assign(n, 0.0);
+  estimate->weights.assign(n, 0.0);
+  std::vector<double> magnitudes;
+  for (std::size_t i = 0; i < n; ++i) {
+    const Beam& beam = beams_[i];
+    const BeamOnCone located = LocateBeam(cone, beam.origin, beam.direction);
+    if (!located.valid) continue;
+    const RangePrediction predicted = PredictRange(located, FootprintOf(cone, beam));
+    estimate->residuals[i] = beam.range - predicted.range;
+    jacobians[i] = predicted.jacobian;
+    estimate->weights[i] = 1.0;
+    magnitudes.push_back(std::abs(estimate->residuals[i]));
+  }
+  const double scale =
+      rescale ? std::max(1.4826 * Median(magnitudes), 0.7 * config_.range_sigma_m)
+              : estimate->sigma;
+  double sum = config_.range_sigma_weight * config_.range_sigma_m * config_.range_sigma_m;
+  double count = config_.range_sigma_weight;
+  double used = 0.0;
+  for (std::size_t i = 0; i < n; ++i) {
+    if (estimate->weights[i] == 0.0) continue;
+    const double w = RobustWeight(estimate->residuals[i] / scale);
+    estimate->weights[i] = w;
+    sum += w * estimate->residuals[i] * estimate->residuals[i];
+    used += w;
+  }
+  count += std::max(0.0, used - 5.0);
+  estimate->sigma = std::sqrt(sum / std::max(1.0, count));
+
+  information->setZero();
+  vector->setZero();
+  const double inverse = 1.0 / (estimate->sigma * estimate->sigma);
+  const double ring_variance = config_.ring_bias_sigma_m * config_.ring_bias_sigma_m;
+  // A laser's offset is common to its ring: sigma^2 I + b^2 1 1^T per ring, inverted by Woodbury.
+  Vector6d ring_jacobian = Vector6d::Zero();
+  double ring_residual = 0.0, ring_weight = 0.0;
+  const auto close_ring = [&]() {
+    if (ring_variance > 0.0 && ring_weight > 0.0) {
+      const double gain =
+          ring_variance * inverse * inverse / (1.0 + ring_variance * inverse * ring_weight);
+      information->topLeftCorner<6, 6>() -= gain * ring_jacobian * ring_jacobian.transpose();
+      vector->head<6>() -= gain * ring_residual * ring_jacobian;
+    }
+    ring_jacobian.setZero();
+    ring_residual = ring_weight = 0.0;
+  };
+  for (std::size_t i = 0; i < n; ++i) {
+    if (i > 0 && beams_[i].row != beams_[i - 1].row) close_ring();
+    const double w = estimate->weights[i];
+    if (w == 0.0) continue;
+    const Vector6d& J = jacobians[i];
+    information->topLeftCorner<6, 6>() += (w * inverse) * J * J.transpose();
+    vector->head<6>() += (w * inverse * estimate->residuals[i]) * J;
+    ring_jacobian += w * J;
+    ring_residual += w * estimate->residuals[i];
+    ring_weight += w;
+  }
+  close_ring();
+  const double slope_information = 1.0 / (config_.taper_sigma_m_per_m * config_.taper_sigma_m_per_m);
+  (*information)(kSlope, kSlope) += slope_information;
+  (*vector)[kSlope] -= slope_information * cone.slope;
+  const double bias_information = 1.0 / (config_.edge_bias_sigma_m * config_.edge_bias_sigma_m);
+  (*information)(kEdgeBias, kEdgeBias) += bias_information;
+  (*vector)[kEdgeBias] -= bias_information * estimate->edge_bias;
+  // A vague prior keeps degenerate geometry solvable; what it alone holds ends as UNRESOLVED.
+  const double length = 1.0;
+  for (int k = 0; k < 2; ++k) (*information)(k, k) += 1.0;
+  for (int k = 2; k < 5; ++k) (*information)(k, k) += 1.0 / (length * length);
+
+  intervals->clear();
+  estimate->edges = estimate->edges_violated = 0;
+  for (const Edge& edge : edges_) {
+    const BeamOnCone hit = LocateBeam(cone, edge.hit.origin, edge.hit.direction);
+    const BeamOnCone miss = LocateBeam(cone, edge.miss.origin, edge.miss.direction);
+    if (!hit.valid || !miss.valid) continue;
+    const double side = miss.offset > hit.offset ? 1.0 : -1.0;
+    const double width = side * (miss.offset - hit.offset);
+    // Only neighbours across the axis see the silhouette; one along it sees an end.
+    const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
+    if (width < 0.5 * apart || side * miss.offset < 0.0) continue;
+    double hit_Y = 1.0, miss_Y = 1.0;
+    const double hit_edge =
+        DetectionOffset(hit.silhouette, hit.sin_angle, FootprintOf(cone, edge.hit),
+                        config_.detection_fraction, edge.competing, &hit_Y);
+    const double miss_edge =
+        DetectionOffset(miss.silhouette, miss.sin_angle, FootprintOf(cone, edge.miss),
+                        config_.detection_fraction, edge.competing, &miss_Y);
+    // Both beams see the same crossing; the mean of the two distances moves with the state.
+    Interval interval;
+    interval.g.setZero();
+    interval.g.head<6>() =
+        0.5 * (hit_Y * hit.d_silhouette - side * hit.d_offset + miss_Y * miss.d_silhouette -
+               side * miss.d_offset);
+    interval.g[kEdgeBias] = 1.0;
+    const double low = side * hit.offset - hit_edge - estimate->edge_bias;
+    const double high = side * miss.offset - miss_edge - estimate->edge_bias;
+    if (!(low < high)) continue;
+    interval.low = low;
+    interval.high = high;
+    ++estimate->edges;
+    const double slack = 4.0 * std::hypot(config_.edge_sigma_m, config_.edge_bias_sigma_m);
+    if (low > slack || high < -slack) ++estimate->edges_violated;
+    intervals->push_back(interval);
+  }
+}
+
+Estimate SegmentFit::Refine(const Cone& start) const {
+  constexpr double kOutlier = 0.02;
+  Estimate estimate;
+  estimate.cone = start;
+  Recentre(&estimate.cone, {});
+  Matrix7d information;
+  Vector7d vector;
+  std::vector<Interval> intervals;
+  for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
+    Linearise(&estimate, iteration < 5, &information, &vector, &intervals);
+    const Posterior posterior =
+        Propagate(information, vector, config_.edge_sigma_m, kOutlier, &intervals);
+    if (!posterior.mean.allFinite()) return estimate;
+    estimate.covariance = posterior.covariance;
+    if (estimate.converged) break;
+    Vector7d step = posterior.mean;
+    double shrink = 1.0;
+    shrink = std::min(shrink, 0.3 / std::max(1e-12, step.head<2>().norm()));
+    shrink = std::min(shrink, 0.3 / std::max(1e-12, step.segment<2>(2).norm()));
+    shrink = std::min(shrink, 0.4 * estimate.cone.radius / std::max(1e-12, std::abs(step[kRadius])));
+    step *= shrink;
+    estimate.cone = estimate.cone.Retract(step.head<6>());
+    estimate.edge_bias += step[kEdgeBias];
+    Recentre(&estimate.cone, estimate.weights);
+    // One more linearisation after the last step: the covariance belongs to the result.
+    estimate.converged = iteration >= 3 && shrink == 1.0 && step.head<2>().norm() < 3e-4 &&
+                         step.segment<3>(2).norm() < 5e-5;
+  }
+  return estimate;
+}
+
+void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
+  const Cone& cone = estimate.cone;
+  out->cylinder.axis = cone.axis;
+  out->cylinder.point = cone.point;
+  out->cylinder.curvature = 1.0 / cone.radius;
+  Matrix5d to_cylinder = Matrix5d::Identity();
+  to_cylinder(4, 4) = -1.0 / (cone.radius * cone.radius);
+  out->covariance =
+      to_cylinder * estimate.covariance.topLeftCorner<5, 5>() * to_cylinder.transpose();
+  out->covariance = 0.5 * (out->covariance + out->covariance.transpose()).eval();
+  out->taper_m_per_m = cone.slope;
+  out->taper_sigma_m_per_m = std::sqrt(estimate.covariance(kSlope, kSlope));
+  out->taper_estimated = out->taper_sigma_m_per_m < 0.5 * config_.taper_sigma_m_per_m;
+  if (!out->taper_estimated) out->taper_m_per_m = 0.0;
+
+  double low = std::numeric_limits<double>::infinity(), high = -low;
+  double arc_low = low, arc_high = -low;
+  double deviation = 0.0;
+  int last_row = -1;
+  for (std::size_t i = 0; i < beams_.size(); ++i) {
+    if (estimate.weights[i] < 0.5) continue;
+    const Beam& beam = beams_[i];
+    ++out->num_points;
+    if (beam.row != last_row) ++out->num_rings;
+    last_row = beam.row;
+    deviation += std::abs(estimate.residuals[i]);
+    const double s = (beam.point - cone.point).dot(cone.axis);
+    low = std::min(low, s);
+    high = std::max(high, s);
+    const BeamOnCone located = LocateBeam(cone, beam.origin, beam.direction);
+    if (!located.valid) continue;
+    const double angle = std::asin(std::clamp(located.offset / located.silhouette, -1.0, 1.0));
+    arc_low = std::min(arc_low, angle);
+    arc_high = std::max(arc_high, angle);
+  }
+  if (out->num_points > 0) {
+    out->start_s_m = low;
+    out->end_s_m = high;
+    out->mean_abs_deviation_m = deviation / out->num_points;
+    out->visible_arc_rad = std::max(0.0, arc_high - arc_low);
+  }
+  out->distance_m = (cone.point - origin_).norm();
+  // The true end lies anywhere up to the next beam along the axis.
+  const Eigen::Vector3d view = (cone.point - origin_).normalized();
+  const Eigen::Vector3d across = Eigen::Vector3d::UnitZ().cross(view);
+  const double level = std::min(1.0, std::abs(cone.axis.dot(across.normalized())));
+  const double steep = std::sqrt(std::max(0.0, 1.0 - level * level));
+  const double column_step = out->distance_m * 2.0 * M_PI / image_.cols;
+  double ring_step = column_step;
+  if (out->num_rings > 1) {
+    ring_step = std::max(column_step, (high - low) / (out->num_rings - 1));
+  }
+  out->end_sigma_m = (steep > 0.5 ? ring_step : column_step) / std::sqrt(3.0);
+}
+
+FittedCylinder SegmentFit::Fit() {
+  FittedCylinder out;
+  out.segment_id = segment_.id;
+  out.covariance = 1e6 * Matrix5d::Identity();
+  const auto unresolved = [&](UnresolvedReason reason) {
+    out.status = FitStatus::kUnresolved;
+    out.reason = reason;
+    return out;
+  };
+  Collect();
+  out.num_points = static_cast<int>(beams_.size());
+  out.num_rings = num_rings_;
+  if (out.num_points > 0) {
+    out.cylinder.point = centroid_;
+    out.cylinder.curvature = 1.0 / config_.min_radius_m;
+    out.distance_m = (centroid_ - origin_).norm();
+  }
+  if (out.num_points < config_.min_points) {
+    return unresolved(non_finite_ > 0 ? UnresolvedReason::kNonFinite
+                                      : UnresolvedReason::kTooFewPoints);
+  }
+  if (num_rings_ < config_.min_rings) return unresolved(UnresolvedReason::kTooFewRings);
+  const std::optional<Cone> start = Start();
+  if (!start) return unresolved(UnresolvedReason::kNotConverged);
+
+  Estimate estimate;
+  if (config_.marshall_only) {
+    estimate.cone = *start;
+    Recentre(&estimate.cone, {});
+    Matrix7d information;
+    Vector7d vector;
+    std::vector<Interval> intervals;
+    Linearise(&estimate, true, &information, &vector, &intervals);
+    estimate.covariance = information.ldlt().solve(Matrix7d::Identity());
+    estimate.edges = estimate.edges_violated = 0;
+    estimate.converged = true;
+  } else {
+    CollectEdges();
+    estimate = Refine(*start);
+  }
+  const double r = estimate.cone.radius;
+  const bool finite = estimate.cone.axis.allFinite() && estimate.cone.point.allFinite() &&
+                      std::isfinite(r) && estimate.covariance.allFinite();
+  if (!finite) return unresolved(UnresolvedReason::kNotConverged);
+  if (!(r >= config_.min_radius_m) || !(r <= config_.max_radius_m)) {
+    return unresolved(UnresolvedReason::kRadiusOutOfRange);
+  }
+  out.num_points = out.num_rings = 0;
+  Report(estimate, &out);
+  if (!estimate.converged) return unresolved(UnresolvedReason::kNotConverged);
+  if (out.num_points < config_.min_points) return unresolved(UnresolvedReason::kNotACylinder);
+  if (out.num_rings < config_.min_rings) return unresolved(UnresolvedReason::kTooFewRings);
+  if (estimate.sigma > config_.max_residual_sigma_m ||
+      3 * out.num_points < 2 * static_cast<int>(beams_.size()) ||
+      (estimate.edges >= 4 && 2 * estimate.edges_violated > estimate.edges)) {
+    return unresolved(UnresolvedReason::kNotACylinder);
+  }
+  if (out.visible_arc_rad < config_.min_visible_arc_deg * kDegree) {
+    return unresolved(UnresolvedReason::kArcTooSmall);
+  }
+  const double axis_sigma = std::sqrt(std::max(estimate.covariance(0, 0), estimate.covariance(1, 1)));
+  if (std::sqrt(estimate.covariance(kRadius, kRadius)) > config_.max_radius_sigma_ratio * r ||
+      axis_sigma > config_.max_axis_sigma_deg * kDegree) {
+    return unresolved(UnresolvedReason::kUncertain);
+  }
+  out.status = FitStatus::kMeasured;
+  out.reason = UnresolvedReason::kNone;
+  return out;
+}
+
+}  // namespace
+
+void CylinderFitterConfig::Validate() const {
+  const auto positive = [](double v) { return std::isfinite(v) && v > 0.0; };
+  const auto not_negative = [](double v) { return std::isfinite(v) && v >= 0.0; };
+  Require(min_points >= 6, "min_points", ">= 6");
+  Require(min_rings >= 2, "min_rings", ">= 2");
+  Require(positive(min_radius_m), "min_radius_m", "> 0");
+  Require(std::isfinite(max_radius_m) && max_radius_m > min_radius_m, "max_radius_m",
+          "> min_radius_m");
+  Require(positive(min_visible_arc_deg), "min_visible_arc_deg", "> 0");
+  Require(positive(max_radius_sigma_ratio), "max_radius_sigma_ratio", "> 0");
+  Require(positive(max_axis_sigma_deg), "max_axis_sigma_deg", "> 0");
+  Require(positive(max_residual_sigma_m), "max_residual_sigma_m", "> 0");
+  Require(positive(range_sigma_m), "range_sigma_m", "> 0");
+  Require(not_negative(range_sigma_weight), "range_sigma_weight", ">= 0");
+  Require(positive(taper_sigma_m_per_m), "taper_sigma_m_per_m", "> 0");
+  Require(not_negative(beam_exit_horizontal_m), "beam_exit_horizontal_m", ">= 0");
+  Require(not_negative(beam_exit_vertical_m), "beam_exit_vertical_m", ">= 0");
+  Require(not_negative(beam_divergence_horizontal_rad), "beam_divergence_horizontal_rad", ">= 0");
+  Require(not_negative(beam_divergence_vertical_rad), "beam_divergence_vertical_rad", ">= 0");
+  Require(positive(detection_fraction) && detection_fraction < 1.0, "detection_fraction",
+          "in (0, 1)");
+  Require(not_negative(echo_separation_m), "echo_separation_m", ">= 0");
+  Require(positive(edge_sigma_m), "edge_sigma_m", "> 0");
+  Require(positive(edge_bias_sigma_m), "edge_bias_sigma_m", "> 0");
+  Require(not_negative(ring_bias_sigma_m), "ring_bias_sigma_m", ">= 0");
+}
+
+CylinderFitter::CylinderFitter(const CylinderFitterConfig& config) : config_(config) {
+  config_.Validate();
+}
+
+std::vector<FittedCylinder> CylinderFitter::Fit(const LabelledScan& scan,
+                                                const std::vector<Segment>& segments) const {
+  std::vector<FittedCylinder> cylinders;
+  cylinders.reserve(segments.size());
+  for (const Segment& segment : segments) cylinders.push_back(FitSegment(scan, segment));
+  return cylinders;
+}
+
+FittedCylinder CylinderFitter::FitSegment(const LabelledScan& scan, const Segment& segment) const {
+  for (const std::int32_t pixel : segment.pixels) {
+    if (pixel < 0 || static_cast<std::size_t>(pixel) >= scan.image.size()) {
+      throw std::invalid_argument("Segment.pixels: index outside the range image");
+    }
+  }
+  return SegmentFit(scan, segment, config_).Fit();
+}
+
+}  // namespace dendro
