@@ -1,6 +1,5 @@
 #include "dendro_slam/ros/params.h"
 
-#include <dlfcn.h>
 #include <fmt/format.h>
 #include <XmlRpcException.h>
 #include <XmlRpcValue.h>
@@ -116,17 +115,6 @@ std::size_t EditDistance(const std::string& a, const std::string& b) {
   throw ParamError(fmt::format("{}: expected {}, got {}", where, expected, tree.TypeName()));
 }
 
-std::string ShareFolder() {
-  Dl_info info{};
-  if (dladdr(reinterpret_cast<const void*>(&ShareFolder), &info) != 0 && info.dli_fname != nullptr) {
-    std::error_code error;
-    const std::filesystem::path library = std::filesystem::canonical(info.dli_fname, error);
-    const std::filesystem::path share = library.parent_path().parent_path() / "share/dendro_slam";
-    if (!error && std::filesystem::exists(share / "config", error)) return share.string();
-  }
-  return DENDRO_SOURCE_DIR;
-}
-
 }  // namespace
 
 const ParamTree::Map& ParamTree::AsMap(const std::string& where) const {
@@ -236,13 +224,5 @@ void FailInvalid(const std::string& where, const std::string& what) {
 }
 
 }  // namespace internal
-
-std::string ResolvePath(const std::string& path) {
-  std::error_code error;
-  if (path.empty() || std::filesystem::exists(path, error)) return path;
-  if (std::filesystem::path(path).is_absolute()) return path;
-  const std::filesystem::path shared = std::filesystem::path(ShareFolder()) / path;
-  return std::filesystem::exists(shared, error) ? shared.string() : path;
-}
 
 }  // namespace dendro_ros

@@ -7,6 +7,7 @@
 #include <limits>
 #include <random>
 
+#include "dendro_slam/geometry/so3.h"
 #include "dendro_slam/ros/markers.h"
 #include "dendro_slam/ros/point_cloud2.h"
 
@@ -19,7 +20,7 @@ using dendro::Vector6d;
 Eigen::Isometry3d SomePose() {
   Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
   T.linear() = dendro::ExpSo3({0.4, -0.9, 1.3});
-  T.translation() = {1.0, -2.0, 0.5};
+  T.translation() = Eigen::Vector3d(1.0, -2.0, 0.5);
   return T;
 }
 

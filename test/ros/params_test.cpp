@@ -111,11 +111,5 @@ TEST(ConfigKeys, ListsNestedKeys) {
   EXPECT_EQ(ConfigKeys<SomeConfig>(), expected);
 }
 
-TEST(ResolvePath, FindsWhatThePackageShips) {
-  EXPECT_EQ(ResolvePath("/does/not/exist"), "/does/not/exist");
-  EXPECT_EQ(ResolvePath("no/such/file"), "no/such/file");
-  EXPECT_NE(ResolvePath("config"), "config");
-}
-
 }  // namespace
 }  // namespace dendro_ros

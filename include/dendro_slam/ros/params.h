@@ -154,9 +154,4 @@ Config ReadConfig(const ParamTree& tree, const std::string& where) {
   return config;
 }
 
-/// A path of a configuration: absolute paths as they are; others are looked for from the working
-/// directory and then in the package's share (installed or source) folder.
-/// @return The first that exists; the path unchanged when none does.
-std::string ResolvePath(const std::string& path);
-
 }  // namespace dendro_ros
