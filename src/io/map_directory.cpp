@@ -8,6 +8,7 @@
 #include <cmath>
 #include <cstring>
 #include <filesystem>
+#include <limits>
 #include <optional>
 #include <set>
 #include <sstream>
@@ -897,6 +898,13 @@ void ScanWriter::Add(const LabelledScan& scan,
     const std::int32_t id =
         pixel < 0 ? std::int32_t{-1} : segment_of_pixel[static_cast<std::size_t>(pixel)];
     WriteLittleEndian(segments_, id);
+  }
+  for (const std::int32_t pixel : scan.image.pixel_of_point) {
+    const float range = pixel < 0 ? std::numeric_limits<float>::quiet_NaN()
+                                  : scan.image.range[static_cast<std::size_t>(pixel)];
+    std::uint32_t bits = 0;
+    std::memcpy(&bits, &range, sizeof(bits));
+    WriteLittleEndian(segments_, bits);
   }
   Check(segments_, kScanFiles[2]);
 }

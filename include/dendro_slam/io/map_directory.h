@@ -74,7 +74,8 @@ void WriteFileAtomically(const std::string& path, const std::string& content);
 ///
 /// scan_labels.bin: magic "DSLABEL1", then per scan int64 stamp_ns, uint32 count, count x uint8 Label
 /// in the order of the source cloud. scan_segments.bin: magic "DSSEGMT1", then per scan int64 stamp_ns,
-/// uint32 count, count x int32 segment id (-1 none). All little-endian.
+/// uint32 count, count x int32 segment id (-1 none), count x float32 range [m] (NaN where the point could
+/// not be projected). All little-endian.
 class ScanWriter {
  public:
   /// @throws MapFileError
