@@ -45,17 +45,17 @@ struct LidarSimulatorConfig {
   double echo_separation_m = 0.76;
 
   bool enable_detection_limit = true;
-  /// Smallest part of the footprint's energy, relative to a full target of `reference_reflectivity`
-  /// at the same range, that triggers a return. The sensor adapts its laser power to the scene, so
-  /// near by the limit is relative and not absolute. A fifth follows this project's measurements.
+  /// Smallest part of the footprint that must lie on the surfaces of an echo. The sensor adapts its
+  /// laser power to the scene, so near by the limit is a part of the beam and not an energy. A fifth
+  /// is this project's working value, not a figure of the maker.
   double detection_fraction = 0.2;
-  double reference_reflectivity = 0.4;
-  /// Range at which a full target of 10 % reflectivity is detected half of the time [m]; the energy
-  /// falls with the square of the range.
+  /// Range at which a full, perpendicular target of 10 % reflectivity is detected half of the time
+  /// [m]; the echo's energy falls with the square of the range. The data sheet promises 100 m
+  /// without naming a target.
   double range_10_percent_m = 60.0;
-  /// Width of the transition from no return to sure return, as a ratio of energies (sigma of the
-  /// logarithm); 0 makes a hard limit.
-  double detection_softness = 0.15;
+  /// Width of the transition from no return to sure return, as sigma of the logarithm of both
+  /// limits; 0 makes them hard.
+  double detection_softness = 0.1;
 
   bool enable_dropouts = true;
   double dropout_probability = 0.002;  ///< Of a return that would be there, whatever its strength.
@@ -88,7 +88,6 @@ struct LidarSimulatorConfig {
     v("echo_separation_m", echo_separation_m);
     v("enable_detection_limit", enable_detection_limit);
     v("detection_fraction", detection_fraction);
-    v("reference_reflectivity", reference_reflectivity);
     v("range_10_percent_m", range_10_percent_m);
     v("detection_softness", detection_softness);
     v("enable_dropouts", enable_dropouts);

@@ -41,7 +41,8 @@ struct OdometrySimulatorConfig {
   double jump_position_m = 0.15;             ///< Sigma of a jump per axis [m].
   double jump_yaw_deg = 1.5;                 ///< Sigma of a jump in yaw [deg].
   double loss_interval_s = 0.0;              ///< Mean time between losses of tracking [s]; 0 never.
-  double loss_duration_s = 1.0;              ///< Messages are missing for this long [s].
+  double loss_duration_s = 1.0;              ///< Messages are missing for this long [s]; meanwhile
+                                             ///< the position walks ten times as fast.
 
   // mavros: PX4's EKF output is anchored by GNSS; its error is bounded and slowly varying.
   double mavros_position_sigma_m = 0.05;     ///< Slow error of each axis [m].
@@ -78,7 +79,8 @@ struct OdometrySimulatorConfig {
 
 /// Makes odometry from a true motion, message by message, deterministic in the seed.
 ///
-/// `t265`: visual-inertial odometry. The odom frame is the body's pose at the start (identity).
+/// `t265`: visual-inertial odometry. The odom frame is the body's place and heading at the start,
+/// with z up.
 /// Increments of the true motion carry a scale error and random walks in position and yaw; roll and
 /// pitch errors stay bounded. The covariance is what realsense2_camera writes from the tracker
 /// confidence (0.01 m^2 * 10^(3 - confidence) linear): it does not tell the drift.

@@ -98,7 +98,7 @@ struct SceneBox {
 
 /// A triangle mesh; `vertices` are already moved to their place.
 struct SceneMesh {
-  std::string file;                                       ///< As the scene file names it.
+  std::string file;                                       ///< Absolute; LoadScene makes it so.
   Eigen::Vector3d position = Eigen::Vector3d::Zero();
   double scale = 1.0;
   double yaw_deg = 0.0;
@@ -109,7 +109,7 @@ struct SceneMesh {
 
 /// A real scan; each point becomes a small sphere. `points` are already moved to their place.
 struct SceneCloud {
-  std::string file;
+  std::string file;                                       ///< Absolute; LoadScene makes it so.
   double point_radius_m = 0.008;
   Eigen::Vector3d position = Eigen::Vector3d::Zero();
   SurfaceKind kind = SurfaceKind::kTrunk;
