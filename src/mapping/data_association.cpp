@@ -90,6 +90,7 @@ LineResidual ComputeLineResidual(const FittedCylinder& observation,
   S.diagonal().segment<2>(2).array() += config.offset_sigma_floor_m * config.offset_sigma_floor_m;
   out.residual = r.head<4>();
   out.covariance = S.topLeftCorner<4, 4>();
+  out.J_pose = J_pose.topRows<4>();
   out.offset_m = r.segment<2>(2).norm();
 
   out.radius_m = observation.cylinder.radius() + observation.taper_m_per_m * s_observation;

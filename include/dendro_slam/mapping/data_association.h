@@ -50,6 +50,8 @@ struct LineResidual {
   Eigen::Vector4d residual = Eigen::Vector4d::Zero();  ///< Axis (2, rad), offset (2, m), in the
                                                        ///< observation's tangent coordinates.
   Eigen::Matrix4d covariance = Eigen::Matrix4d::Zero();  ///< Of the residual.
+  Eigen::Matrix<double, 4, 6> J_pose = Eigen::Matrix<double, 4, 6>::Zero();  ///< Of the residual for
+                                                       ///< the pose's right tangent.
   double overlap_m = 0.0;    ///< Length of the common extent; negative is a gap.
   double angle_rad = 0.0;    ///< Between the axes, without sign.
   double offset_m = 0.0;     ///< Between the lines at the overlap's middle.
