@@ -282,6 +282,7 @@ void WoodIcpConfig::Validate() const {
   Require(final_correspondence_m > 0.0 && final_correspondence_m <= max_correspondence_m,
           "final_correspondence_m must be in (0, max_correspondence_m]");
   Require(noise_sigma_m > 0.0, "noise_sigma_m must be > 0");
+  Require(normal_sigma_rad >= 0.0, "normal_sigma_rad must be >= 0");
   Require(correlation_points >= 1.0, "correlation_points must be >= 1");
   Require(sigma_floor_rad >= 0.0, "sigma_floor_rad must be >= 0");
   Require(sigma_floor_m >= 0.0, "sigma_floor_m must be >= 0");
@@ -347,7 +348,8 @@ std::optional<RelativeMotion> WoodIcp::State::Register(const ScanPixels& current
   const double reach = std::max(0.1, std::sqrt(reach2 / static_cast<double>(n)));
 
   const double across2 = config.noise_sigma_m * config.noise_sigma_m;
-  const double along2 = 0.25 * 0.25;
+  // Wide enough that neighbouring rings do not hold each other, narrow enough to settle.
+  const double along2 = 0.1 * 0.1;
   const double degenerate = config.degenerate_sigma_m / 10.0;
 
   Eigen::Isometry3d T = guess;
@@ -356,6 +358,8 @@ std::optional<RelativeMotion> WoodIcp::State::Register(const ScanPixels& current
   Matrix6d honest = Matrix6d::Zero();  // information across the surfaces only
   double chi2 = 0.0, chi2_dof = 0.0;
   iterations = 0;
+  constexpr int kFreezeAfter = 12;
+  std::vector<int> partner(n, -1);
   while (iterations < config.max_iterations && !converged) {
     ++iterations;
     Matrix6d H = Matrix6d::Zero();
@@ -365,11 +369,16 @@ std::optional<RelativeMotion> WoodIcp::State::Register(const ScanPixels& current
     chi2_dof = 0.0;
     num_correspondences = 0;
     const Eigen::Matrix3d R = T.linear();
+    // Returns between two partners flip from one to the other for ever: after a while the partners
+    // stay, and the problem has an optimum.
+    const bool frozen = iterations > kFreezeAfter && limit <= config.final_correspondence_m;
     const float limit2 = static_cast<float>(limit * limit);
-    for (const SurfacePoint& s : source) {
+    for (std::size_t i = 0; i < n; ++i) {
+      const SurfacePoint& s = source[i];
       const Eigen::Vector3d p = s.position.cast<double>();
       const Eigen::Vector3d q = T * p;
-      const int index = tree.Nearest(q.cast<float>(), limit2);
+      if (!frozen) partner[i] = tree.Nearest(q.cast<float>(), limit2);
+      const int index = partner[i];
       if (index < 0) continue;
       const SurfacePoint& t = target[static_cast<std::size_t>(index)];
       if (t.shape != s.shape) continue;
@@ -408,7 +417,10 @@ std::optional<RelativeMotion> WoodIcp::State::Register(const ScanPixels& current
 
       H.noalias() += weight * J.transpose() * M * J;
       b.noalias() += weight * J.transpose() * (M * e);
-      honest.noalias() += weight * J.transpose() * (P / (2.0 * across2)) * J;
+      // Errors of the normals look like information along the surface; its mean is taken off.
+      const double normal2 = config.normal_sigma_rad * config.normal_sigma_rad;
+      const Eigen::Matrix3d known = P - normal2 * (Eigen::Matrix3d::Identity() - P);
+      honest.noalias() += weight * J.transpose() * (known / (2.0 * across2)) * J;
       chi2 += weight * r2;
       chi2_dof += weight * dof;
       ++num_correspondences;
