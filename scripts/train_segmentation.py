@@ -36,11 +36,11 @@ PLANES = 8
 MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE = range(PLANES)
 IGNORE = 255
 
-LAYERS = ("stem:20:3x5:1x2 nb:1x1 push "
-          "down:40:2x2 nb:1x1 nb:1x2 push "
+LAYERS = ("stem:16:3x5:1x2 nb:1x1 push "
+          "down:32:2x2 nb:1x1 nb:1x2 push "
           "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
-          "up:40:2x2 add nb:1x1 "
-          "up:20:2x2 add nb:1x1 "
+          "up:32:2x2 add nb:1x1 "
+          "up:16:2x2 add nb:1x1 "
           "out:4:3x4:1x2")
 FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x2 nb:2x4 "
                   "up:10:2x2 add up:6:2x2 add nb:1x1 out:4:3x4:1x2")
