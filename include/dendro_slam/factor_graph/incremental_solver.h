@@ -102,8 +102,12 @@ class IncrementalSolver {
   /// factor at all: it is then removed too.
   UpdateResult RemoveFactors(const std::vector<FactorId>& factors);
 
-  /// Batch mode: re-linearises everything and iterates Levenberg-Marquardt to the optimum.
+  /// Batch mode: re-linearises everything in a new elimination order and iterates
+  /// Levenberg-Marquardt to the optimum.
   UpdateResult Optimize();
+
+  /// Adds variables and factors as Update does, but without a step of its own, then Optimize().
+  UpdateResult OptimizeBatch(const FactorList& new_factors, const Values& new_values);
 
   /// Replaces variables by the linear factor that they leave on their neighbours (Schur complement
   /// at the present estimate) and removes them with all their factors, so that a long run stays
