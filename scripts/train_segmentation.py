@@ -36,11 +36,11 @@ PLANES = 8
 MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE = range(PLANES)
 IGNORE = 255
 
-LAYERS = ("stem:20:3x5:1x2 nb:1x1 push "
-          "down:40:2x2 nb:1x1 nb:1x2 push "
+LAYERS = ("stem:16:3x5:1x2 nb:1x1 push "
+          "down:32:2x2 nb:1x1 nb:1x2 push "
           "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
-          "up:40:2x2 add nb:1x1 "
-          "up:20:2x2 add nb:1x1 "
+          "up:32:2x2 add nb:1x1 "
+          "up:16:2x2 add nb:1x1 "
           "out:4:3x4:1x2")
 FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x2 nb:2x4 "
                   "up:10:2x2 add up:6:2x2 add nb:1x1 out:4:3x4:1x2")
@@ -301,21 +301,26 @@ def load_exported(path):
 # Data
 # ---------------------------------------------------------------------------------------------
 class Dataset:
-    """One folder of simulate_training_scans: meta.json, planes.f16, labels.u8."""
+    """Folders of simulate_training_scans, one after the other: meta.json, planes.f16, labels.u8."""
 
-    def __init__(self, folder):
-        folder = pathlib.Path(folder)
-        self.meta = json.loads((folder / "meta.json").read_text())
-        self.count, self.rows, self.cols = (self.meta[k] for k in ("count", "rows", "cols"))
-        if self.meta["planes"] != PLANES or self.meta["input"] != "dendro_range_planes_1":
-            raise SystemExit(f"train_segmentation: {folder} holds other input planes; simulate anew")
-        shape = (self.count, PLANES, self.rows, self.cols)
-        self.planes = np.memmap(folder / "planes.f16", "<f2", "r", shape=shape)
-        labels = np.fromfile(folder / "labels.u8", np.uint8).reshape(self.count, self.rows, self.cols)
-        self.labels = np.where(labels == 0, IGNORE, labels - 1).astype(np.uint8)
-        self.wood_columns = [np.flatnonzero((self.labels[i] == WOOD).any(0)) for i in range(self.count)]
-        self.busy_columns = [np.flatnonzero(((self.labels[i] != IGNORE) & (self.labels[i] != 0)).any(0))
-                             for i in range(self.count)]
+    def __init__(self, folders):
+        self.planes, self.labels, self.scans, self.seeds = [], [], [], []
+        for folder in sorted(folders):
+            meta = json.loads((folder / "meta.json").read_text())
+            if meta["planes"] != PLANES or meta["input"] != "dendro_range_planes_1":
+                raise SystemExit(f"train_segmentation: {folder} holds other planes; simulate anew")
+            self.rows, self.cols = meta["rows"], meta["cols"]
+            shape = (meta["count"], PLANES, self.rows, self.cols)
+            self.planes += list(np.memmap(folder / "planes.f16", "<f2", "r", shape=shape))
+            labels = np.fromfile(folder / "labels.u8", np.uint8).reshape(-1, self.rows, self.cols)
+            self.labels += list(np.where(labels == 0, IGNORE, labels - 1).astype(np.uint8))
+            self.scans += meta["scans"]
+            self.seeds.append(meta["seed"])
+        self.count = len(self.planes)
+        if not self.count:
+            raise SystemExit("train_segmentation: no simulated scans")
+        self.wood_columns = [np.flatnonzero((y == WOOD).any(0)) for y in self.labels]
+        self.busy_columns = [np.flatnonzero(((y != IGNORE) & (y != 0)).any(0)) for y in self.labels]
 
     def crop(self, index, start, width):
         columns = (start + np.arange(width)) % self.cols
@@ -438,7 +443,7 @@ def evaluate(net, data, indices=None):
         row = np.array([(wood & guess).sum(), (wood | guess).sum(), ((label == truth) & valid).sum(),
                         valid.sum(), wood.sum(), (wood & guess & far).sum(), (wood & far).sum(),
                         guess.sum()], float)
-        for key in ("all", data.meta["scans"][i]["kind"]):
+        for key in ("all", data.scans[i]["kind"]):
             sums[key] = sums.get(key, 0) + row
     scores = {}
     for key, s in sums.items():
@@ -480,7 +485,7 @@ def train(args):
     torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    training, held_out = Dataset(args.data / "train"), Dataset(args.data / "held_out")
+    training, held_out = Dataset(finished(args.data, "train_*")), Dataset(finished(args.data, "held_out"))
     net = ErfNet(args.layers).to(device)
     phases = [("encoder", args.encoder_epochs), ("decoder", args.decoder_epochs),
               ("joint", args.joint_epochs)]
@@ -546,6 +551,8 @@ def train(args):
             if line["wood_iou"] > state["best"]:
                 state.update(best=line["wood_iou"], stale=0,
                              best_state={k: v.clone() for k, v in average.state.items()})
+                # An interrupted training leaves its best weights behind.
+                write_safetensors(args.output, *smooth.eval().export())
             elif phase == "joint":
                 state["stale"] += 1
         state["log"].append(line)
@@ -595,8 +602,8 @@ Wood, ground, leaf and other in a VLP-16 range image. Written by `scripts/train_
 - Layers: `{args.layers}`
 - Parameters: {parameters} (32-bit floats, batch normalisation folded), {args.output.stat().st_size / 1e6:.2f} MB
 - Input: {PLANES} planes, see `include/dendro_slam/segmentation/network_input.h`
-- Data: simulated only, {training.count} scans to train (seed {training.meta['seed']}), {held_out.count}
-  held out (seed {held_out.meta['seed']}, other scenes), {training.rows} x {training.cols}, by `simulate_training_scans`
+- Data: simulated only, {training.count} scans to train (scene seeds from {training.seeds[0]}), {held_out.count}
+  held out (scene seeds from {held_out.seeds[0]}, other scenes), {training.rows} x {training.cols}, by `simulate_training_scans`
 - Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.batch} crops
   {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
   {state['seconds'] / 60:.0f} min on {args.threads} CPU core(s) or a GPU
@@ -633,14 +640,29 @@ def write_fixture(folder, seed=7):
                       {"input": x[0].numpy(), "logits": logits[0].numpy()})
 
 
+def finished(folder, pattern):
+    return [p.parent for p in folder.glob(pattern + "/meta.json")]
+
+
 def simulate(args):
+    """Simulates what is missing, a few folders at a time. Every folder has its own scene seeds."""
     program = ROOT / "build/devel/lib/dendro_slam/simulate_training_scans"
-    if not program.exists():
+    jobs = [("held_out", args.test_scans, 900000)] if not finished(args.data, "held_out") else []
+    if not finished(args.data, "train_*"):
+        share = -(-args.train_scans // args.folders)
+        jobs += [(f"train_{k}", share, 1000 + k * 100000) for k in range(args.folders)]
+    if jobs and not program.exists():
         raise SystemExit("train_segmentation: build first (scripts/build simulate_training_scans)")
-    for name, count, seed in (("train", args.train_scans, 1000), ("held_out", args.test_scans, 900000)):
-        if not (args.data / name / "meta.json").exists():
-            subprocess.run([str(program), "-o", str(args.data / name), "--scans", str(count),
-                            "--seed", str(seed)], check=True)
+    running = []
+    for name, count, seed in jobs:
+        print(f"simulating {count} scans into {args.data / name}", flush=True)
+        running.append(subprocess.Popen([str(program), "-o", str(args.data / name), "--scans",
+                                         str(count), "--seed", str(seed)]))
+        if len(running) == args.threads:
+            if running.pop(0).wait():
+                raise SystemExit("train_segmentation: the simulation failed")
+    if any(process.wait() for process in running):
+        raise SystemExit("train_segmentation: the simulation failed")
 
 
 def main():
@@ -650,6 +672,7 @@ def main():
     parser.add_argument("--output", type=pathlib.Path,
                         default=ROOT / "config/models/erfnet_wood.safetensors")
     parser.add_argument("--train-scans", type=int, default=900)
+    parser.add_argument("--folders", type=int, default=6, help="that the training scans are spread over")
     parser.add_argument("--test-scans", type=int, default=120)
     parser.add_argument("--held-out-scans", type=int, default=40, help="scored during the training")
     parser.add_argument("--layers", default=LAYERS)
@@ -677,7 +700,7 @@ def main():
     simulate(args)
     if args.evaluate:
         torch.set_num_threads(args.threads)
-        print(json.dumps(evaluate(load_exported(args.evaluate), Dataset(args.data / "held_out")), indent=1))
+        print(json.dumps(evaluate(load_exported(args.evaluate), Dataset(finished(args.data, "held_out"))), indent=1))
         return
     train(args)
 

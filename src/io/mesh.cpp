@@ -42,7 +42,10 @@ void Append(std::string* out, T value) {
 
 Rgb BranchColor(int branch_id) {
   if (branch_id < 0) return kInferredColor;
-  return kOkabeIto[static_cast<std::size_t>(branch_id) % kOkabeIto.size()];
+  const auto id = static_cast<std::size_t>(branch_id);
+  const Rgb color = kOkabeIto[id % kOkabeIto.size()];
+  const bool dark = (id / kOkabeIto.size()) % 2 == 1;
+  return dark ? Mix(color, Rgb{0, 0, 0}, 0.4) : color;
 }
 
 Rgb OrderColor(int order) {

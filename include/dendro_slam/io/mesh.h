@@ -22,7 +22,8 @@ struct Mesh {
 
 enum class MeshColor { kByBranch, kByOrder, kBySigma };
 
-/// Colour of a branch: Okabe and Ito's palette, safe for colour-blind readers, by id.
+/// Colour of a branch: Okabe and Ito's palette, safe for colour-blind readers, by id; every second round
+/// of its seven colours is darker.
 Rgb BranchColor(int branch_id);
 /// Colour of a branch order (0 trunk).
 Rgb OrderColor(int order);

@@ -14,7 +14,7 @@ struct DataAssociationConfig {
                                     ///< chi-squared distribution's normal counterpart. > 0.
   double max_axis_angle_deg = 20.0; ///< Axes farther apart never match [deg]. In (0, 90).
   double max_offset_m = 0.5;        ///< Axis lines farther apart never match [m]. > 0.
-  double max_offset_radii = 1.5;    ///< The same as a multiple of the landmark's radius (plus the
+  double max_offset_radii = 1.0;    ///< The same as a multiple of the landmark's radius (plus the
                                     ///< sigmas); the smaller of both rules. > 0.
   double extent_tolerance_m = 0.10; ///< Extents may miss each other by this much [m]. >= 0.
   double max_radius_ratio = 1.6;    ///< Radii farther apart than this factor never match, unless
@@ -50,6 +50,8 @@ struct LineResidual {
   Eigen::Vector4d residual = Eigen::Vector4d::Zero();  ///< Axis (2, rad), offset (2, m), in the
                                                        ///< observation's tangent coordinates.
   Eigen::Matrix4d covariance = Eigen::Matrix4d::Zero();  ///< Of the residual.
+  Eigen::Matrix<double, 4, 6> J_pose = Eigen::Matrix<double, 4, 6>::Zero();  ///< Of the residual for
+                                                       ///< the pose's right tangent.
   double overlap_m = 0.0;    ///< Length of the common extent; negative is a gap.
   double angle_rad = 0.0;    ///< Between the axes, without sign.
   double offset_m = 0.0;     ///< Between the lines at the overlap's middle.

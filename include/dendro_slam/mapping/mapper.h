@@ -20,14 +20,18 @@ struct MapperConfig {
   double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
 
   // Odometry. The messages' own covariances do not tell the drift.
-  double vio_sigma_rad_per_m = 0.003;   ///< Rotation drift per metre travelled [rad/m]. >= 0.
-  double vio_sigma_m_per_m = 0.012;     ///< Translation drift per metre travelled. >= 0.
-  double vio_sigma_per_rad = 0.01;      ///< Rotation drift per radian turned. >= 0.
-  double vio_sigma_floor_rad = 0.0015;  ///< Per step, per axis [rad]. > 0.
-  double vio_sigma_floor_m = 0.004;     ///< Per step, per axis [m]. > 0.
+  double vio_walk_m_per_sqrt_m = 0.012;   ///< Random walk per axis per root metre travelled. >= 0.
+  double vio_walk_rad_per_sqrt_m = 0.003; ///< Random walk of the rotation per root metre [rad]. >= 0.
+  double vio_sigma_m_per_m = 0.006;     ///< Scale error: translation drift per metre travelled. >= 0.
+  double vio_sigma_per_rad = 0.005;     ///< Rotation drift per radian turned. >= 0.
+  double vio_sigma_floor_rad = 0.0008;  ///< Of one step, per axis [rad]. > 0.
+  double vio_sigma_floor_m = 0.002;     ///< Of one step, per axis [m]. > 0.
+  double icp_scale = 1.5;               ///< ICP's sigmas are multiplied by this. > 0.
   double odometry_gate_sigma = 4.0;     ///< VIO and ICP that differ by more are not both believed. > 0.
-  double vio_max_speed_mps = 8.0;       ///< A faster VIO step is a jump, whatever ICP says [m/s]. > 0.
-  double vio_max_turn_rad_per_s = 6.0;  ///< A faster VIO turn is a jump [rad/s]. > 0.
+  double max_speed_mps = 15.0;          ///< A faster step is a jump, whatever else agrees [m/s]. > 0.
+  double max_turn_rad_per_s = 8.0;      ///< A faster turn is a jump [rad/s]. > 0.
+  double max_acceleration_mps2 = 12.0;  ///< A VIO step that needs more is tested against the map and
+                                        ///< ICP [m/s^2]. > 0.
   double blind_sigma_m_per_s = 0.5;     ///< Motion with no odometry at all: sigma per second [m/s]. > 0.
   double blind_sigma_rad_per_s = 0.5;   ///< The same for rotation [rad/s]. > 0.
 
@@ -61,14 +65,17 @@ struct MapperConfig {
     v("key_frame_distance_m", key_frame_distance_m);
     v("key_frame_angle_deg", key_frame_angle_deg);
     v("key_frame_time_s", key_frame_time_s);
-    v("vio_sigma_rad_per_m", vio_sigma_rad_per_m);
+    v("vio_walk_m_per_sqrt_m", vio_walk_m_per_sqrt_m);
+    v("vio_walk_rad_per_sqrt_m", vio_walk_rad_per_sqrt_m);
     v("vio_sigma_m_per_m", vio_sigma_m_per_m);
     v("vio_sigma_per_rad", vio_sigma_per_rad);
     v("vio_sigma_floor_rad", vio_sigma_floor_rad);
     v("vio_sigma_floor_m", vio_sigma_floor_m);
+    v("icp_scale", icp_scale);
     v("odometry_gate_sigma", odometry_gate_sigma);
-    v("vio_max_speed_mps", vio_max_speed_mps);
-    v("vio_max_turn_rad_per_s", vio_max_turn_rad_per_s);
+    v("max_speed_mps", max_speed_mps);
+    v("max_turn_rad_per_s", max_turn_rad_per_s);
+    v("max_acceleration_mps2", max_acceleration_mps2);
     v("blind_sigma_m_per_s", blind_sigma_m_per_s);
     v("blind_sigma_rad_per_s", blind_sigma_rad_per_s);
     v("observation_scale", observation_scale);

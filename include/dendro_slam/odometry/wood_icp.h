@@ -24,6 +24,7 @@ struct WoodIcpConfig {
   double max_correspondence_m = 0.6;  ///< Pairs farther apart are ignored at first [m]. > 0.
   double final_correspondence_m = 0.2;  ///< The same when the motion has settled [m]. > 0.
   double noise_sigma_m = 0.02;   ///< Floor of the residual's standard deviation [m]. > 0.
+  double normal_sigma_rad = 0.06;  ///< Error of a return's surface normal [rad]. >= 0.
   double correlation_points = 4.0;  ///< Neighbouring returns whose errors act as one: the covariance grows
                                     ///< by it. >= 1.
   double sigma_floor_rad = 0.002;   ///< Added to the covariance of every motion, per axis [rad]. >= 0.
@@ -52,6 +53,7 @@ struct WoodIcpConfig {
     v("max_correspondence_m", max_correspondence_m);
     v("final_correspondence_m", final_correspondence_m);
     v("noise_sigma_m", noise_sigma_m);
+    v("normal_sigma_rad", normal_sigma_rad);
     v("correlation_points", correlation_points);
     v("sigma_floor_rad", sigma_floor_rad);
     v("sigma_floor_m", sigma_floor_m);

@@ -1,0 +1,49 @@
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "dendro_slam/range_image/projector.h"
+#include "dendro_slam/range_image/range_image.h"
+#include "dendro_slam/sim/lidar_simulator.h"
+#include "dendro_slam/sim/scene.h"
+
+namespace dendro {
+
+/// A range image with the true class of every pixel.
+struct TrainingScan {
+  RangeImage image;
+  std::vector<Label> truth;  ///< Of the nearest return of each pixel; kNone without a return.
+  std::string kind;          ///< See TrainingKinds().
+  std::uint64_t seed = 0;    ///< Of the scene.
+};
+
+/// Kinds of random scenes for training and scoring the segmentation:
+///   thesis    one or two bare, stout trees on a plane, sensor upright, 3 to 8 m away
+///   leafless  bare trees of all forms, rough ground, rocks, grass, walls, crates, pillars, people
+///   leafy     the same, in leaf
+///   tilted    any of these, the sensor mounted at a random angle, up to lying on its side
+const std::vector<std::string>& TrainingKinds();
+
+/// A random scene of a kind, a deterministic function of the seed. Reflectivities are drawn at
+/// random too, so that nobody learns that bark has one brightness.
+/// @throws std::invalid_argument for an unknown kind.
+Scene RandomTrainingScene(const std::string& kind, std::uint64_t seed);
+
+/// Scans of one random scene from random places around its trees (2 to 12 m away, 0.5 to 8 m above
+/// the ground, never inside something), moving at up to 1 m/s, with all effects of the sensor.
+/// @param count      Number of scans.
+/// @param lidar      Sensor model; its seed is replaced by one drawn from `seed`.
+/// @param projector  Size of the range image.
+std::vector<TrainingScan> SimulateTrainingScans(const std::string& kind,
+                                                std::uint64_t seed,
+                                                int count,
+                                                const LidarSimulatorConfig& lidar,
+                                                const ProjectorConfig& projector);
+
+/// The true class of every pixel of a projected scan.
+/// @param truth  Per point of the cloud that the image was projected from.
+std::vector<Label> PixelTruth(const RangeImage& image, const std::vector<PointTruth>& truth);
+
+}  // namespace dendro

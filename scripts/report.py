@@ -1,0 +1,180 @@
+#!/usr/bin/python3
+"""A report of a map directory: one self-contained HTML file and a PDF.
+
+    scripts/report.py MAP_DIR [--truth TRUTH] [--tape CSV] [-o NAME]
+
+Writes MAP_DIR/report.html and MAP_DIR/report.pdf (or NAME.html and NAME.pdf). With --truth (the folder
+that simulate_bag writes) radii and trajectory are drawn against it; with --tape a table of differences
+to tape measurements is added (columns: branch or height, radius_cm or circumference_cm).
+"""
+
+import argparse
+import base64
+import html
+import io
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+import matplotlib.pyplot as plt  # noqa: E402
+from matplotlib.backends.backend_pdf import PdfPages  # noqa: E402
+
+from dendro_eval.errors import InputError  # noqa: E402
+from dendro_eval.figures import all_figures  # noqa: E402
+from dendro_eval.files import MapDirectory, Truth  # noqa: E402
+from dendro_eval.scores import evaluate  # noqa: E402
+from dendro_eval.tape import compare_tape  # noqa: E402
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.6em; margin-bottom: .1em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; font-size: .9em; } td, th { padding: .25em .7em; text-align: right; border-bottom: 1px solid #eee; }
+th { border-bottom: 2px solid #888; vertical-align: bottom; } td.text, th.text { text-align: left; }
+figure { margin: 1em 0; } figure img { max-width: 100%; } figcaption { color: #666; font-size: .9em; }
+.swatch { display: inline-block; width: .9em; height: .9em; border: 1px solid #555; vertical-align: -.1em; }
+.bad { color: #a33c00; }
+"""
+
+
+def number(value, digits=3, scale=1.0, sign=False):
+    if value is None or value == "":
+        return "&ndash;"
+    return f"{float(value) * scale:{'+' if sign else ''}.{digits}f}"
+
+
+def with_sigma(value, sigma, digits=1, scale=100.0):
+    if value is None or value == "":
+        return "&ndash;"
+    return f"{float(value) * scale:.{digits}f} &plusmn; {float(sigma) * scale:.{digits}f}"
+
+
+def table(header, rows, text_columns=(0,)):
+    def cells(tag, values):
+        return "".join(f'<{tag}{" class=text" if i in text_columns else ""}>{v}</{tag}>'
+                       for i, v in enumerate(values))
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f"<table><thead><tr>{cells('th', header)}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def tree_table(map_dir):
+    return table(
+        ["tree", "DBH [cm]", "at [m]", "height seen [m]", "branches", "orders",
+         "stem volume [m&sup3;]", "wood volume [m&sup3;]", "above radius [cm]", "lean [&deg;]", "arc seen [&deg;]",
+         "scans", "status"],
+        [[r["tree_id"], with_sigma(r["dbh_m"], r["dbh_sigma_m"] or 0.0), number(r["dbh_height_m"], 2),
+          number(r["height_m"], 2), r["num_branches"], r["max_branch_order"],
+          number(r["stem_volume_m3"], 3),
+          with_sigma(r["wood_volume_m3_above_min_radius"], r["volume_sigma_m3"], 3, 1.0),
+          number(r["min_radius_m"], 1, 100), number(r["lean_deg"], 1), number(r["arc_coverage_deg"], 0),
+          r["num_scans"], r["status"]] for r in map_dir.trees])
+
+
+def branch_table(map_dir):
+    from dendro_eval.figures import branch_color
+    rows = []
+    for r in sorted(map_dir.branch_rows, key=lambda r: (r["tree_id"] == "", int(r["tree_id"] or 0),
+                                                        int(r["branch_order"]), int(r["branch_id"]))):
+        swatch = f'<span class=swatch style="background:{branch_color(int(r["branch_id"]))}"></span>'
+        rows.append([f'{swatch} {r["branch_id"]}', r["tree_id"] or "none", r["parent_branch_id"] or "&ndash;",
+                     r["branch_order"], with_sigma(r["base_diameter_m"], r["base_diameter_sigma_m"]),
+                     number(r["middle_diameter_m"], 1, 100), number(r["tip_diameter_m"], 1, 100),
+                     number(r["length_m"], 2), number(r["angle_deg"], 0), number(r["azimuth_deg"], 0),
+                     number(r["height_m"], 2), f'{r["num_measured"]} of {r["num_cylinders"]}'])
+    return table(["branch", "tree", "leaves", "order", "&oslash; base [cm]", "&oslash; middle [cm]",
+                  "&oslash; tip [cm]", "length [m]", "angle [&deg;]", "azimuth [&deg;]", "height [m]",
+                  "cylinders measured"], rows)
+
+
+def score_table(scores):
+    b, t = scores["branches"], scores["trajectory"]
+    percent = lambda v: number(v, 1, 100) + ("" if v is None else " %")  # noqa: E731
+    rows = [["branches found, of the observable", f'{b["found"]} of {b["observable"]}'],
+            ["branches of the map that are none", b["false"]],
+            ["radius error, median", percent(b["radius_error_rel_median"])],
+            ["radius error, 95th percentile", percent(b["radius_error_rel_p95"])],
+            ["radius bias", percent(b["radius_bias_rel"])],
+            ["truths inside the 68 % / 95 % intervals",
+             f'{percent(b["sigma_coverage_68"])} / {percent(b["sigma_coverage_95"])}'],
+            ["axis error, median [&deg;]", number(b["axis_error_deg_median"], 2)],
+            ["parent right", percent(b["parent_correct_ratio"])],
+            ["trajectory error, RMS [cm]", number(t["ate_rmse_m"], 1, 100)],
+            ["trajectory error, largest [cm]", number(t["ate_max_m"], 1, 100)]]
+    for tree in scores["trees"]:
+        rows.append([f'DBH of {html.escape(tree["name"])} [cm], truth / map',
+                     f'{number(tree["dbh_truth_m"], 1, 100)} / '
+                     f'{with_sigma(tree["dbh_m"], tree["dbh_sigma_m"] or 0.0)}'])
+    return table(["score", ""], rows)
+
+
+def tape_table(rows):
+    differences = [abs(r["difference_m"]) for r in rows if r["difference_m"] is not None]
+    body = [[html.escape(r["name"]), number(r["tape_m"], 2, 100), with_sigma(r["map_m"], r["sigma_m"] or 0, 2),
+             number(r["difference_m"], 2, 100, sign=True), r["note"]] for r in rows]
+    mean = f"<p>Mean absolute difference {100 * sum(differences) / len(differences):.2f} cm over " \
+           f"{len(differences)} places.</p>" if differences else ""
+    return table(["place", "tape, radius [cm]", "map, radius [cm]", "difference [cm]", ""], body,
+                 text_columns=(0, 4)) + mean
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("map_dir", metavar="MAP_DIR")
+    parser.add_argument("--truth", help="truth folder of the simulation")
+    parser.add_argument("--tape", metavar="CSV", help="tape measurements")
+    parser.add_argument("-o", "--output", metavar="NAME", help="path without ending; default MAP_DIR/report")
+    arguments = parser.parse_args()
+    try:
+        map_dir = MapDirectory(arguments.map_dir)
+        truth = Truth(arguments.truth) if arguments.truth else None
+        scores = evaluate(map_dir, truth) if truth else None
+        tape = compare_tape(arguments.tape, map_dir) if arguments.tape else None
+        name = arguments.output or os.path.join(arguments.map_dir, "report")
+        title = "Map of " + os.path.basename(os.path.normpath(arguments.map_dir))
+        parts = [f"<h1>{html.escape(title)}</h1>"]
+        loose = sum(b.tree is None for b in map_dir.branches or [])
+        parts.append(f"<p>{len(map_dir.trees or [])} trees, {len(map_dir.branches or []) - loose} branches, "
+                     f"{loose} pieces that could not be attached. Intervals are &plusmn; 1 sigma.</p>")
+        if not map_dir.branches:
+            parts.append("<p class=bad>The map holds no branch.</p>")
+        if map_dir.trees:
+            parts.append("<h2>Trees</h2>" + tree_table(map_dir))
+        if scores:
+            parts.append("<h2>Against the truth</h2>" + score_table(scores))
+        if tape:
+            parts.append("<h2>Against the tape</h2>" + tape_table(tape))
+        os.makedirs(os.path.dirname(os.path.abspath(name)), exist_ok=True)
+        with PdfPages(name + ".pdf.tmp", metadata={"Title": title, "CreationDate": None}) as pdf:
+            for _, caption, figure in all_figures(map_dir, truth, scores):
+                picture = io.BytesIO()
+                figure.savefig(picture, format="png", metadata={"Software": None})
+                data = base64.b64encode(picture.getvalue()).decode()
+                parts.append(f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
+                             f"<figcaption>{html.escape(caption)}</figcaption></figure>")
+                pdf.savefig(figure)
+                plt.close(figure)
+            if not pdf.get_pagecount():
+                figure = plt.figure(figsize=(6, 2))
+                figure.text(0.5, 0.5, "The map holds no branch.", ha="center")
+                pdf.savefig(figure)
+                plt.close(figure)
+        os.replace(name + ".pdf.tmp", name + ".pdf")
+        if map_dir.branch_rows:
+            parts.append("<h2>Branches</h2>" + branch_table(map_dir))
+        page = (f"<!doctype html><html lang=en><head><meta charset=utf-8><title>{html.escape(title)}</title>"
+                f"<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n")
+        with open(name + ".html.tmp", "w", encoding="utf-8") as stream:
+            stream.write(page)
+        os.replace(name + ".html.tmp", name + ".html")
+        print(f"{name}.html\n{name}.pdf")
+    except InputError as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"report: {error.filename or ''}: {error.strerror}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,887 @@
+#include "dendro_slam/mapping/mapper.h"
+
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include <Eigen/Cholesky>
+
+#include "dendro_slam/factor_graph/between_factor.h"
+#include "dendro_slam/factor_graph/cylinder_factor.h"
+#include "dendro_slam/factor_graph/incremental_solver.h"
+#include "dendro_slam/factor_graph/prior_factor.h"
+#include "dendro_slam/mapping/relocalizer.h"
+#include "dendro_slam/sensors/lidar_scan.h"
+
+namespace dendro {
+
+namespace {
+
+constexpr double kRadPerDeg = 0.017453292519943295;
+
+void Require(bool ok, const char* message) {
+  if (!ok) throw std::invalid_argument(std::string("MapperConfig: ") + message);
+}
+
+Key PoseKey(int index) { return MakeKey('x', static_cast<std::uint64_t>(index)); }
+Key LandmarkKey(int id) { return MakeKey('l', static_cast<std::uint64_t>(id)); }
+
+bool IsPositiveDefinite(const Eigen::Ref<const Eigen::MatrixXd>& m) {
+  if (!m.allFinite()) return false;
+  const Eigen::LLT<Eigen::MatrixXd> llt(m);
+  return llt.info() == Eigen::Success;
+}
+
+// A motion with its uncertainty in the right tangent.
+struct UncertainMotion {
+  Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
+  Matrix6d covariance = Matrix6d::Zero();
+};
+
+// First a, then b.
+UncertainMotion Compose(const UncertainMotion& a, const UncertainMotion& b) {
+  const Matrix6d A = AdjointSe3(b.T.inverse());
+  return {NormalizedSe3(a.T * b.T), A * a.covariance * A.transpose() + b.covariance};
+}
+
+// Covariance-weighted mean of two measurements of one motion.
+UncertainMotion Fuse(const UncertainMotion& a, const UncertainMotion& b) {
+  const Vector6d d = LogSe3(a.T.inverse() * b.T);
+  const Matrix6d S = a.covariance + b.covariance;
+  const Eigen::LDLT<Matrix6d> ldlt(S);
+  const Matrix6d K = a.covariance * ldlt.solve(Matrix6d::Identity());
+  UncertainMotion out;
+  out.T = NormalizedSe3(a.T * ExpSe3(K * d));
+  const Matrix6d P = a.covariance - K * a.covariance;
+  out.covariance = 0.5 * (P + P.transpose());
+  return out;
+}
+
+// The estimate of a fit's line when its radius is known from elsewhere: a one-sided view sees the
+// surface, so a radius too large puts the axis too far away. Conditional gaussian in the five
+// tangent coordinates.
+FittedCylinder ConditionOnRadius(const FittedCylinder& fit, double radius, double radius_sigma) {
+  if (!(radius > 0.0) || !(radius_sigma > 0.0)) return fit;
+  const double kappa = 1.0 / radius;
+  const double kappa_sigma = radius_sigma * kappa * kappa;
+  const Vector5d column = fit.covariance.col(4);
+  const double innovation_variance = column[4] + kappa_sigma * kappa_sigma;
+  const Vector5d gain = column / innovation_variance;
+  FittedCylinder out = fit;
+  out.cylinder = fit.cylinder.Retract(gain * (kappa - fit.cylinder.curvature));
+  if (!(out.cylinder.curvature > 0.0)) return fit;
+  const Matrix5d C = fit.covariance - gain * column.transpose();
+  out.covariance = 0.5 * (C + C.transpose());
+  return out;
+}
+
+}  // namespace
+
+void MapperConfig::Validate() const {
+  Require(key_frame_distance_m > 0.0, "key_frame_distance_m must be > 0");
+  Require(key_frame_angle_deg > 0.0, "key_frame_angle_deg must be > 0");
+  Require(key_frame_time_s > 0.0, "key_frame_time_s must be > 0");
+  Require(vio_walk_m_per_sqrt_m >= 0.0, "vio_walk_m_per_sqrt_m must be >= 0");
+  Require(vio_walk_rad_per_sqrt_m >= 0.0, "vio_walk_rad_per_sqrt_m must be >= 0");
+  Require(vio_sigma_m_per_m >= 0.0, "vio_sigma_m_per_m must be >= 0");
+  Require(vio_sigma_per_rad >= 0.0, "vio_sigma_per_rad must be >= 0");
+  Require(vio_sigma_floor_rad > 0.0, "vio_sigma_floor_rad must be > 0");
+  Require(vio_sigma_floor_m > 0.0, "vio_sigma_floor_m must be > 0");
+  Require(icp_scale > 0.0, "icp_scale must be > 0");
+  Require(odometry_gate_sigma > 0.0, "odometry_gate_sigma must be > 0");
+  Require(max_speed_mps > 0.0, "max_speed_mps must be > 0");
+  Require(max_turn_rad_per_s > 0.0, "max_turn_rad_per_s must be > 0");
+  Require(max_acceleration_mps2 > 0.0, "max_acceleration_mps2 must be > 0");
+  Require(blind_sigma_m_per_s > 0.0, "blind_sigma_m_per_s must be > 0");
+  Require(blind_sigma_rad_per_s > 0.0, "blind_sigma_rad_per_s must be > 0");
+  Require(observation_scale > 0.0, "observation_scale must be > 0");
+  Require(observation_axis_floor_deg >= 0.0, "observation_axis_floor_deg must be >= 0");
+  Require(observation_offset_floor_m >= 0.0, "observation_offset_floor_m must be >= 0");
+  Require(robust_width > 0.0, "robust_width must be > 0");
+  Require(min_radius_m > 0.0, "min_radius_m must be > 0");
+  Require(max_radius_sigma_rel > 0.0, "max_radius_sigma_rel must be > 0");
+  Require(relocalize_axis_deg > 0.0, "relocalize_axis_deg must be > 0");
+  Require(relocalize_offset_m > 0.0, "relocalize_offset_m must be > 0");
+  Require(relocalize_radius_ratio > 1.0, "relocalize_radius_ratio must be > 1");
+  Require(relocalize_min_matches >= 2, "relocalize_min_matches must be >= 2");
+  Require(relocalize_tilt_deg > 0.0, "relocalize_tilt_deg must be > 0");
+  Require(relocalize_every_key_frames >= 1, "relocalize_every_key_frames must be >= 1");
+  Require(relocalize_max_scans >= 10, "relocalize_max_scans must be >= 10");
+  association.Validate();
+  tree_map.Validate();
+  radius_profile.Validate();
+}
+
+class Mapper::Impl {
+ public:
+  explicit Impl(const MapperConfig& config_in)
+      : config(config_in), map(config_in.tree_map, config_in.radius_profile) {}
+
+  MapperResult AddScan(const MapperInput& input);
+  MapperResult AddScanWhileLost(const MapperInput& input);
+  std::vector<StampedPose> Trajectory() const;
+  std::vector<LandmarkState> StatesWithMarginals() const;
+  void StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3d& T_map_lidar);
+
+  MapperConfig config;
+  TreeMap map;
+  IncrementalSolver solver;
+
+  // Key frames and the trajectory hung on them.
+  struct TrajectoryEntry {
+    std::int64_t stamp_ns;
+    int key_frame;
+    Eigen::Isometry3d T_kf_lidar;
+  };
+  std::vector<TrajectoryEntry> trajectory;
+  int num_key_frames = 0;
+  std::int64_t key_frame_stamp_ns = 0;
+  Eigen::Isometry3d T_map_kf = Eigen::Isometry3d::Identity();
+  Matrix6d kf_covariance = Matrix6d::Zero();
+
+  // Motion since the key frame.
+  UncertainMotion since_kf;                 // the chain of the best steps
+  std::optional<UncertainMotion> icp_since_kf;
+  std::optional<Eigen::Isometry3d> T_odom_kf;  // unset when VIO was absent or rejected since
+  std::int64_t last_stamp_ns = 0;
+  std::optional<Eigen::Isometry3d> T_odom_last;
+  std::optional<Vector6d> velocity;         // of the last step, body frame
+  double last_score = 0.0;
+
+  Eigen::Isometry3d T_map_odom = Eigen::Isometry3d::Identity();
+  bool upright = false;
+  std::int64_t scan_number = 0;
+
+  // First pose: known exactly, unless it comes from finding a loaded map again.
+  std::optional<Eigen::Isometry3d> start_pose;
+
+  // Landmarks near the key frame, in its frame, with their covariance relative to it.
+  std::vector<Landmark> nearby;
+
+  // A loaded map that has not been found yet.
+  std::optional<MapSnapshot> pending;
+  std::unique_ptr<Mapper> local;
+  std::vector<MapperInput> buffer;
+  int tried_at_key_frame = 0;
+
+ private:
+  struct Hypothesis {
+    UncertainMotion kf_now;      // prior
+    UncertainMotion step;        // from the last scan
+    bool uses_vio = false;
+    bool uses_icp = false;
+    std::vector<Match> matches;  // landmark: index into nearby
+    Eigen::Isometry3d T_kf_lidar = Eigen::Isometry3d::Identity();  // refined
+    double score = 0.0;
+  };
+
+  std::vector<FittedCylinder> Usable(const std::vector<FittedCylinder>& cylinders) const;
+  UncertainMotion VioMotion(const Eigen::Isometry3d& T) const;
+  void Evaluate(const std::vector<FittedCylinder>& cylinders, Hypothesis* h) const;
+  FittedCylinder Conditioned(const FittedCylinder& fit,
+                             const Landmark& landmark,
+                             const Eigen::Isometry3d& T_frame_lidar) const;
+  bool InsideALandmark(const FittedCylinder& fit, const Eigen::Isometry3d& T_kf_lidar) const;
+  void AddKeyFrame(const MapperInput& input,
+                   const std::vector<FittedCylinder>& cylinders,
+                   const Hypothesis& h,
+                   bool first,
+                   MapperResult* result);
+  FactorPtr ObservationFactor(int key_frame,
+                              int id,
+                              const FittedCylinder& fit,
+                              const Eigen::Isometry3d& T_map_lidar) const;
+  void MaintainMap();
+  void MoveFactors(Key from, Key to, const std::vector<FactorId>& factors, const Cylinder* initial);
+  void RefreshLines();
+  void RefreshNearby(int id);
+};
+
+std::vector<FittedCylinder> Mapper::Impl::Usable(
+    const std::vector<FittedCylinder>& cylinders) const {
+  std::vector<FittedCylinder> out;
+  out.reserve(cylinders.size());
+  for (const FittedCylinder& c : cylinders) {
+    if (c.status != FitStatus::kMeasured) continue;
+    if (!c.cylinder.axis.allFinite() || !c.cylinder.point.allFinite() ||
+        !std::isfinite(c.cylinder.curvature) || !(c.cylinder.curvature > 0.0) ||
+        !std::isfinite(c.start_s_m) || !std::isfinite(c.end_s_m) || c.end_s_m <= c.start_s_m ||
+        !std::isfinite(c.taper_m_per_m) || !std::isfinite(c.taper_sigma_m_per_m) ||
+        std::abs(c.cylinder.axis.norm() - 1.0) > 1e-3) {
+      continue;
+    }
+    const double radius = c.cylinder.radius();
+    if (radius < config.min_radius_m) continue;
+    if (!IsPositiveDefinite(c.covariance)) continue;
+    if (c.radius_sigma_m() > config.max_radius_sigma_rel * radius) continue;
+    FittedCylinder scaled = c;
+    scaled.cylinder.axis.normalize();
+    scaled.covariance *= config.observation_scale * config.observation_scale;
+    const double axis_floor = config.observation_axis_floor_deg * kRadPerDeg;
+    scaled.covariance.diagonal().head<2>().array() += axis_floor * axis_floor;
+    scaled.covariance.diagonal().segment<2>(2).array() +=
+        config.observation_offset_floor_m * config.observation_offset_floor_m;
+    out.push_back(scaled);
+  }
+  return out;
+}
+
+// Noise of a VIO motion: a random walk and a scale error, as visual-inertial odometry drifts.
+UncertainMotion Mapper::Impl::VioMotion(const Eigen::Isometry3d& T) const {
+  const Vector6d xi = LogSe3(T);
+  const double distance = xi.tail<3>().norm(), angle = xi.head<3>().norm();
+  const auto square = [](double x) { return x * x; };
+  const double rotation = square(config.vio_sigma_floor_rad) +
+                          square(config.vio_walk_rad_per_sqrt_m) * distance +
+                          square(config.vio_sigma_per_rad * angle);
+  const double translation = square(config.vio_sigma_floor_m) +
+                             square(config.vio_walk_m_per_sqrt_m) * distance +
+                             square(config.vio_sigma_m_per_m * distance);
+  UncertainMotion out;
+  out.T = T;
+  out.covariance.diagonal().head<3>().setConstant(rotation);
+  out.covariance.diagonal().tail<3>().setConstant(translation);
+  return out;
+}
+
+FittedCylinder Mapper::Impl::Conditioned(const FittedCylinder& fit,
+                                         const Landmark& landmark,
+                                         const Eigen::Isometry3d& T_frame_lidar) const {
+  const double s = (T_frame_lidar * fit.cylinder.point - landmark.cylinder.point)
+                       .dot(landmark.cylinder.axis);
+  return ConditionOnRadius(fit, landmark.RadiusAt(s), landmark.RadiusSigmaAt(s));
+}
+
+// Associates under the prior, refines the pose on the matches, associates again with what is then
+// known, and scores how well the scan fits the map.
+void Mapper::Impl::Evaluate(const std::vector<FittedCylinder>& cylinders, Hypothesis* h) const {
+  std::vector<const Landmark*> landmarks;
+  landmarks.reserve(nearby.size());
+  for (const Landmark& l : nearby) landmarks.push_back(&l);
+  DataAssociationConfig no_floor = config.association;
+  no_floor.axis_sigma_floor_deg = 0.0;
+  no_floor.offset_sigma_floor_m = 0.0;
+
+  Eigen::Isometry3d T = h->kf_now.T;
+  Matrix6d P = h->kf_now.covariance;
+  const Matrix6d prior_information =
+      h->kf_now.covariance.ldlt().solve(Matrix6d::Identity());
+  for (int round = 0; round < 2; ++round) {
+    h->matches = Associate(cylinders, landmarks, T, P, config.association);
+    if (h->matches.empty()) break;
+    Eigen::Isometry3d refined = T;
+    for (int iteration = 0; iteration < 4; ++iteration) {
+      const Vector6d prior_error = LogSe3(h->kf_now.T.inverse() * refined);
+      const Matrix6d Jr = RightJacobianInverseSe3(prior_error);
+      Matrix6d H = Jr.transpose() * prior_information * Jr;
+      Vector6d b = -Jr.transpose() * prior_information * prior_error;
+      for (const Match& match : h->matches) {
+        const Landmark& l = *landmarks[static_cast<std::size_t>(match.landmark)];
+        const FittedCylinder fit =
+            Conditioned(cylinders[static_cast<std::size_t>(match.observation)], l, refined);
+        const LineResidual r =
+            ComputeLineResidual(fit, l, refined, Matrix6d::Zero(), no_floor);
+        const Eigen::Matrix4d W = r.covariance.ldlt().solve(Eigen::Matrix4d::Identity());
+        const double norm = std::sqrt(std::max(0.0, r.residual.dot(W * r.residual)));
+        const double weight = norm > config.robust_width ? config.robust_width / norm : 1.0;
+        H.noalias() += weight * r.J_pose.transpose() * W * r.J_pose;
+        b.noalias() -= weight * r.J_pose.transpose() * (W * r.residual);
+      }
+      const Vector6d step = H.ldlt().solve(b);
+      if (!step.allFinite()) break;
+      refined = NormalizedSe3(refined * ExpSe3(step));
+      P = H.ldlt().solve(Matrix6d::Identity());
+      if (step.norm() < 1e-6) break;
+    }
+    T = refined;
+  }
+  h->T_kf_lidar = T;
+  h->score = 0.0;
+  for (const Match& match : h->matches) {
+    h->score += std::max(0.0, 20.0 - match.mahalanobis2);
+  }
+}
+
+bool Mapper::Impl::InsideALandmark(const FittedCylinder& fit,
+                                   const Eigen::Isometry3d& T_kf_lidar) const {
+  for (const Landmark& l : nearby) {
+    const LineResidual r =
+        ComputeLineResidual(fit, l, T_kf_lidar, Matrix6d::Zero(), config.association);
+    if (r.angle_rad > 20.0 * kRadPerDeg) continue;
+    if (r.overlap_m < 0.5 * (fit.end_s_m - fit.start_s_m)) continue;
+    if (r.offset_m < 0.8 * std::max(r.landmark_radius_m, r.radius_m)) return true;
+  }
+  return false;
+}
+
+FactorPtr Mapper::Impl::ObservationFactor(int key_frame,
+                                          int id,
+                                          const FittedCylinder& fit,
+                                          const Eigen::Isometry3d& T_map_lidar) const {
+  const Landmark summary = map.Summary(id);
+  const LandmarkState& state = map.State(id);
+  FittedCylinder conditioned = Conditioned(fit, summary, T_map_lidar);
+  // The variable's curvature is that at its own anchor: bring the measured one there along the
+  // profile, so that a taper does not pull.
+  const double s_variable = (state.line.point - summary.cylinder.point).dot(summary.cylinder.axis);
+  const double s_fit = (T_map_lidar * fit.cylinder.point - summary.cylinder.point)
+                           .dot(summary.cylinder.axis);
+  const double shift = 1.0 / summary.RadiusAt(s_variable) - 1.0 / summary.RadiusAt(s_fit);
+  if (conditioned.cylinder.curvature + shift > 0.0) conditioned.cylinder.curvature += shift;
+  return std::make_shared<CylinderFactor>(PoseKey(key_frame),
+                                          LandmarkKey(id),
+                                          conditioned.cylinder,
+                                          conditioned.covariance,
+                                          CylinderParts{},
+                                          RobustKernel::Huber(config.robust_width));
+}
+
+void Mapper::Impl::AddKeyFrame(const MapperInput& input,
+                               const std::vector<FittedCylinder>& cylinders,
+                               const Hypothesis& h,
+                               bool first,
+                               MapperResult* result) {
+  const int index = num_key_frames;
+  const Eigen::Isometry3d T_map_lidar = first ? h.T_kf_lidar : NormalizedSe3(T_map_kf * h.T_kf_lidar);
+  FactorList factors;
+  Values values;
+  values.Insert(PoseKey(index), Value(T_map_lidar));
+  if (first) {
+    Vector6d sigmas = Vector6d::Constant(1e-4);
+    if (start_pose) {
+      sigmas.head<3>().setConstant(2.0 * config.relocalize_axis_deg * kRadPerDeg);
+      sigmas.tail<3>().setConstant(2.0 * config.relocalize_offset_m);
+    }
+    factors.push_back(
+        std::make_shared<PosePrior>(PoseKey(index), T_map_lidar, NoiseModel::Sigmas(sigmas)));
+  } else {
+    bool any = false;
+    if (h.uses_vio && T_odom_kf && input.T_odom_lidar) {
+      const UncertainMotion vio = VioMotion(T_odom_kf->inverse() * *input.T_odom_lidar);
+      factors.push_back(std::make_shared<BetweenFactor>(
+          PoseKey(index - 1),
+          PoseKey(index),
+          vio.T,
+          NoiseModel::Covariance(vio.covariance).WithKernel(RobustKernel::Huber(3.0))));
+      any = true;
+    }
+    if (icp_since_kf) {
+      factors.push_back(std::make_shared<BetweenFactor>(
+          PoseKey(index - 1),
+          PoseKey(index),
+          icp_since_kf->T,
+          NoiseModel::Covariance(icp_since_kf->covariance).WithKernel(RobustKernel::Cauchy(3.0))));
+      any = true;
+    }
+    if (!any) {
+      factors.push_back(std::make_shared<BetweenFactor>(PoseKey(index - 1),
+                                                        PoseKey(index),
+                                                        h.kf_now.T,
+                                                        NoiseModel::Covariance(h.kf_now.covariance)));
+    }
+  }
+
+  std::vector<int> landmark_of(cylinders.size(), -1);
+  for (const Match& match : h.matches) {
+    landmark_of[static_cast<std::size_t>(match.observation)] =
+        nearby[static_cast<std::size_t>(match.landmark)].id;
+  }
+  std::vector<int> started;
+  for (std::size_t i = 0; i < cylinders.size(); ++i) {
+    int id = landmark_of[i];
+    const bool is_new = id < 0;
+    if (is_new) {
+      if (InsideALandmark(cylinders[i], h.T_kf_lidar)) continue;
+      id = map.Add(cylinders[i], T_map_lidar, scan_number);
+      started.push_back(id);
+      values.Insert(LandmarkKey(id), Value(map.State(id).line));
+    }
+    factors.push_back(ObservationFactor(index, id, cylinders[i], T_map_lidar));
+    for (ObservationVerdict& verdict : result->observations) {
+      if (verdict.segment_id != cylinders[i].segment_id) continue;
+      verdict.landmark_id = id;
+      verdict.is_new = is_new;
+    }
+  }
+
+  UpdateResult update;
+  try {
+    update = solver.Update(factors, values);
+  } catch (const GraphError& error) {
+    // The graph is as before: go on from the old key frame.
+    for (int id : started) map.Remove(id);
+    if (first) throw;
+    result->warning = std::string("key frame left out: ") + error.what();
+    return;
+  }
+  result->is_key_frame = true;
+  result->error_before = update.error_before;
+  result->error_after = update.error_after;
+  result->damping = update.damping;
+  result->variables_relinearized = update.variables_relinearized;
+  result->variables_reeliminated = update.variables_reeliminated;
+
+  ++num_key_frames;
+  key_frame_stamp_ns = input.stamp_ns;
+  T_map_kf = solver.Estimate<Eigen::Isometry3d>(PoseKey(index));
+  since_kf = UncertainMotion{};
+  icp_since_kf = UncertainMotion{};
+  T_odom_kf = input.T_odom_lidar;
+  MaintainMap();
+  RefreshLines();
+}
+
+// Confirms, drops, merges and splits, and keeps the graph in step.
+void Mapper::Impl::MaintainMap() {
+  for (int id : map.Promote(scan_number)) {
+    const std::vector<FactorId> factors = solver.FactorsOf(LandmarkKey(id));
+    solver.RemoveFactors(factors);
+    map.Remove(id);
+  }
+  // A few per key frame: the rest waits for the next one.
+  for (int i = 0; i < 3; ++i) {
+    const std::optional<LandmarkMerge> merge = map.FindDuplicate(config.association);
+    if (!merge) break;
+    MoveFactors(LandmarkKey(merge->drop_id),
+                LandmarkKey(merge->keep_id),
+                solver.FactorsOf(LandmarkKey(merge->drop_id)),
+                nullptr);
+    map.Merge(*merge);
+  }
+  for (int i = 0; i < 3; ++i) {
+    const std::optional<LandmarkSplit> split = map.FindSplit();
+    if (!split) break;
+    const Cylinder line = map.State(split->landmark_id).line;
+    const Matrix5d covariance = map.State(split->landmark_id).covariance;
+    const double middle = 0.5 * (split->gap_begin_m + split->gap_end_m);
+    const std::pair<int, bool> piece = map.Split(*split);
+    map.SetLine(piece.first, line, covariance);
+    std::vector<FactorId> moved;
+    for (FactorId factor : solver.FactorsOf(LandmarkKey(split->landmark_id))) {
+      const auto* observation =
+          dynamic_cast<const CylinderFactor*>(solver.GetFactor(factor).get());
+      if (observation == nullptr) continue;
+      const Eigen::Isometry3d& pose =
+          solver.Estimate<Eigen::Isometry3d>(observation->keys()[0]);
+      const double s = (pose * observation->measured().point - line.point).dot(line.axis);
+      if ((s > middle) == piece.second) moved.push_back(factor);
+    }
+    if (!moved.empty()) {
+      MoveFactors(LandmarkKey(split->landmark_id), LandmarkKey(piece.first), moved, &line);
+    }
+    if (!solver.Contains(LandmarkKey(piece.first))) map.Remove(piece.first);
+    if (!solver.Contains(LandmarkKey(split->landmark_id))) map.Remove(split->landmark_id);
+  }
+}
+
+// Hangs observations of one landmark on another one, which `initial` creates.
+void Mapper::Impl::MoveFactors(Key from,
+                               Key to,
+                               const std::vector<FactorId>& factors,
+                               const Cylinder* initial) {
+  (void)from;
+  FactorList moved;
+  UpdateOptions options;
+  for (FactorId id : factors) {
+    const FactorPtr& factor = solver.GetFactor(id);
+    if (const auto* o = dynamic_cast<const CylinderFactor*>(factor.get())) {
+      moved.push_back(std::make_shared<CylinderFactor>(
+          o->keys()[0], to, o->measured(), o->covariance(), o->parts(), o->noise().kernel()));
+    }
+    options.remove_factors.push_back(id);
+  }
+  Values values;
+  if (initial != nullptr) values.Insert(to, Value(*initial));
+  solver.Update(moved, values, options);
+}
+
+// Brings the landmarks' lines and relative covariances up to date with the graph.
+void Mapper::Impl::RefreshLines() {
+  const Key pose = PoseKey(num_key_frames - 1);
+  T_map_kf = solver.Estimate<Eigen::Isometry3d>(pose);
+  nearby.clear();
+  std::vector<int> ids;
+  std::vector<Key> keys{pose};
+  for (const LandmarkState& state : map.states()) {
+    ids.push_back(state.id);
+    keys.push_back(LandmarkKey(state.id));
+  }
+  const Eigen::MatrixXd joint = solver.JointMarginalCovariance(keys);
+  kf_covariance = joint.topLeftCorner<6, 6>();
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(ids[i]));
+    const Eigen::Index at = 6 + 5 * static_cast<Eigen::Index>(i);
+    // Covariance of the landmark as the key frame sees it: what both drifted together cancels.
+    const Cylinder seen = TransformCylinder(T_map_kf.inverse(), line);
+    Eigen::Matrix<double, 5, 6> J_pose;
+    Matrix5d J_landmark;
+    CylinderObservationResidual(seen, T_map_kf, line, &J_pose, &J_landmark);
+    Eigen::Matrix<double, 5, 11> J;
+    J << J_pose, J_landmark;
+    Eigen::Matrix<double, 11, 11> C;
+    C.topLeftCorner<6, 6>() = joint.topLeftCorner<6, 6>();
+    C.topRightCorner<6, 5>() = joint.block<6, 5>(0, at);
+    C.bottomLeftCorner<5, 6>() = joint.block<5, 6>(at, 0);
+    C.bottomRightCorner<5, 5>() = joint.block<5, 5>(at, at);
+    const Matrix5d relative = J * C * J.transpose();
+    const Matrix5d R = CylinderTangentTransform(T_map_kf, seen);
+    map.SetLine(ids[i], line, R * relative * R.transpose());
+    nearby.emplace_back();
+    nearby.back().id = ids[i];
+    RefreshNearby(ids[i]);
+  }
+}
+
+void Mapper::Impl::RefreshNearby(int id) {
+  for (Landmark& l : nearby) {
+    if (l.id != id) continue;
+    l = map.Summary(id);
+    const Eigen::Isometry3d T_kf_map = T_map_kf.inverse();
+    const Matrix5d R = CylinderTangentTransform(T_kf_map, l.cylinder);
+    l.covariance = R * l.covariance * R.transpose();
+    l.cylinder = TransformCylinder(T_kf_map, l.cylinder);
+  }
+}
+
+MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
+  MapperResult result;
+  result.stamp_ns = input.stamp_ns;
+  const bool first = num_key_frames == 0;
+  if (!first && input.stamp_ns <= last_stamp_ns) {
+    result.warning = "scan refused: its stamp is not later than the one before; reset the mapper "
+                     "when the data starts anew";
+    if (!trajectory.empty()) result.T_map_lidar = T_map_kf * trajectory.back().T_kf_lidar;
+    return result;
+  }
+  MapperInput scan = input;
+  if (scan.T_odom_lidar && !scan.T_odom_lidar->matrix().allFinite()) scan.T_odom_lidar.reset();
+  if (scan.icp && (!scan.icp->T_from_to.matrix().allFinite() ||
+                   !IsPositiveDefinite(scan.icp->covariance) ||
+                   scan.icp->from_stamp_ns != last_stamp_ns ||
+                   scan.icp->to_stamp_ns != scan.stamp_ns)) {
+    scan.icp.reset();
+  }
+  ++scan_number;
+  const std::vector<FittedCylinder> cylinders = Usable(scan.cylinders);
+  for (const FittedCylinder& c : scan.cylinders) {
+    result.observations.push_back({c.segment_id, -1, false});
+  }
+
+  Hypothesis best;
+  if (first) {
+    if (!start_pose) upright = scan.T_odom_lidar.has_value();
+    Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
+    if (start_pose) {
+      T = *start_pose;
+      // The loaded landmarks, in the map frame: the first pose's uncertainty is the search's.
+      nearby = map.Landmarks(true);
+      best.kf_now.T = T;
+      best.kf_now.covariance.diagonal().head<3>().setConstant(
+          std::pow(config.relocalize_axis_deg * kRadPerDeg, 2));
+      best.kf_now.covariance.diagonal().tail<3>().setConstant(
+          std::pow(config.relocalize_offset_m, 2));
+      Evaluate(cylinders, &best);
+    } else {
+      if (scan.T_odom_lidar) T = *scan.T_odom_lidar;
+      best.T_kf_lidar = T;
+    }
+    AddKeyFrame(scan, cylinders, best, true, &result);
+    for (const Match& match : best.matches) {
+      const int id = nearby[static_cast<std::size_t>(match.landmark)].id;
+      if (!map.Has(id)) continue;
+      map.Observe(id, cylinders[static_cast<std::size_t>(match.observation)], T_map_kf, scan_number);
+    }
+    best.T_kf_lidar = Eigen::Isometry3d::Identity();
+  } else {
+    const double dt = std::max(1e-3, NsToSeconds(scan.stamp_ns - last_stamp_ns));
+    std::optional<UncertainMotion> vio, icp;
+    bool suspicious = false;
+    if (scan.T_odom_lidar && T_odom_last) {
+      vio = VioMotion(T_odom_last->inverse() * *scan.T_odom_lidar);
+      const Vector6d xi = LogSe3(vio->T);
+      if (xi.tail<3>().norm() > config.max_speed_mps * dt + 0.05 ||
+          xi.head<3>().norm() > config.max_turn_rad_per_s * dt + 0.05) {
+        vio.reset();
+        result.odometry_rejected = true;
+      } else if (velocity && (xi / dt - *velocity).tail<3>().norm() >
+                                 config.max_acceleration_mps2 * dt + 0.02 / dt) {
+        suspicious = true;
+      }
+    }
+    if (scan.icp) {
+      icp = UncertainMotion{scan.icp->T_from_to,
+                            scan.icp->covariance * config.icp_scale * config.icp_scale};
+      const Vector6d xi = LogSe3(icp->T);
+      if (xi.tail<3>().norm() > config.max_speed_mps * dt + 0.05) icp.reset();
+    }
+    if (vio && icp) {
+      const Vector6d d = LogSe3(vio->T.inverse() * icp->T);
+      const double chi2 = d.dot((vio->covariance + icp->covariance).ldlt().solve(d));
+      if (chi2 > config.odometry_gate_sigma * config.odometry_gate_sigma + 6.0) suspicious = true;
+    }
+    // The last velocity goes on: the only guess left without odometry, and the judge of a jump.
+    UncertainMotion blind;
+    if (velocity) blind.T = ExpSe3(*velocity * std::min(dt, 0.5));
+    blind.covariance.diagonal().head<3>().setConstant(
+        std::pow(config.blind_sigma_rad_per_s * dt, 2));
+    blind.covariance.diagonal().tail<3>().setConstant(std::pow(config.blind_sigma_m_per_s * dt, 2));
+
+    std::vector<Hypothesis> hypotheses;
+    const auto add = [&](const UncertainMotion& step, bool uses_vio, bool uses_icp) {
+      Hypothesis h;
+      h.step = step;
+      h.kf_now = Compose(since_kf, step);
+      h.uses_vio = uses_vio;
+      h.uses_icp = uses_icp;
+      Evaluate(cylinders, &h);
+      hypotheses.push_back(std::move(h));
+    };
+    if (vio && icp && !suspicious) {
+      add(Fuse(*vio, *icp), true, true);
+    } else if (vio) {
+      add(*vio, true, false);
+    } else if (icp) {
+      add(*icp, false, true);
+    } else {
+      add(blind, false, false);
+    }
+    // A scan that suddenly fits the map far worse makes its odometry suspect, too.
+    if (vio && hypotheses.front().score < 0.5 * last_score - 10.0) suspicious = true;
+    if (suspicious) {
+      if (icp && vio) {
+        add(*icp, false, true);
+        add(*vio, true, false);
+      }
+      if (vio) add(blind, false, false);
+    }
+    std::size_t chosen = 0;
+    for (std::size_t i = 1; i < hypotheses.size(); ++i) {
+      if (hypotheses[i].score > 1.2 * hypotheses[chosen].score + 5.0) chosen = i;
+    }
+    best = std::move(hypotheses[chosen]);
+    if (suspicious && vio && !best.uses_vio) result.odometry_rejected = true;
+
+    since_kf = best.kf_now;
+    since_kf.T = best.T_kf_lidar;
+    if (best.uses_vio && !T_odom_kf) best.uses_vio = false;
+    if (!vio || result.odometry_rejected) T_odom_kf.reset();
+    if (icp && icp_since_kf && (best.uses_icp || !suspicious)) {
+      icp_since_kf = Compose(*icp_since_kf, *icp);
+    } else {
+      icp_since_kf.reset();
+    }
+    const Eigen::Isometry3d step = trajectory.back().key_frame == num_key_frames - 1
+                                       ? trajectory.back().T_kf_lidar.inverse() * best.T_kf_lidar
+                                       : best.T_kf_lidar;
+    velocity = LogSe3(step) / dt;
+    last_score = 0.7 * last_score + 0.3 * best.score;
+
+    const Vector6d since = LogSe3(best.T_kf_lidar);
+    const bool key_frame =
+        since.tail<3>().norm() >= config.key_frame_distance_m ||
+        since.head<3>().norm() >= config.key_frame_angle_deg * kRadPerDeg ||
+        NsToSeconds(scan.stamp_ns - key_frame_stamp_ns) >= config.key_frame_time_s;
+    Eigen::Isometry3d T_kf_lidar = best.T_kf_lidar;
+    std::vector<std::pair<int, int>> seen;  // observation, landmark id
+    for (const Match& match : best.matches) {
+      seen.emplace_back(match.observation, nearby[static_cast<std::size_t>(match.landmark)].id);
+    }
+    for (const auto& [observation, id] : seen) {
+      for (ObservationVerdict& verdict : result.observations) {
+        if (verdict.segment_id != cylinders[static_cast<std::size_t>(observation)].segment_id) continue;
+        verdict.landmark_id = id;
+      }
+    }
+    const int before = num_key_frames;
+    if (key_frame) {
+      AddKeyFrame(scan, cylinders, best, false, &result);
+      if (num_key_frames != before) T_kf_lidar = Eigen::Isometry3d::Identity();
+    }
+    const Eigen::Isometry3d T_map_lidar = T_map_kf * T_kf_lidar;
+    for (const auto& [observation, id] : seen) {
+      if (!map.Has(id)) continue;
+      map.Observe(id, cylinders[static_cast<std::size_t>(observation)], T_map_lidar, scan_number);
+      RefreshNearby(id);
+    }
+    best.T_kf_lidar = T_kf_lidar;
+  }
+
+  trajectory.push_back({scan.stamp_ns, num_key_frames - 1, best.T_kf_lidar});
+  last_stamp_ns = scan.stamp_ns;
+  T_odom_last = scan.T_odom_lidar;
+  result.T_map_lidar = NormalizedSe3(T_map_kf * best.T_kf_lidar);
+  const Matrix6d A = AdjointSe3(best.T_kf_lidar.inverse());
+  result.pose_covariance = A * kf_covariance * A.transpose() + since_kf.covariance;
+  if (scan.T_odom_lidar) {
+    T_map_odom = NormalizedSe3(result.T_map_lidar * scan.T_odom_lidar->inverse());
+  }
+  return result;
+}
+
+void Mapper::Impl::StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3d& T_map_lidar) {
+  map.Restore(snapshot.landmarks, snapshot.next_landmark_id);
+  FactorList factors;
+  Values values;
+  for (const LandmarkState& state : snapshot.landmarks) {
+    values.Insert(LandmarkKey(state.id), Value(state.line));
+    Matrix5d covariance = state.covariance;
+    covariance.diagonal().head<2>().array() += 1e-8;
+    covariance.diagonal().segment<2>(2).array() += 1e-8;
+    covariance(4, 4) += 1e-6;
+    factors.push_back(std::make_shared<CylinderPrior>(
+        LandmarkKey(state.id), state.line, NoiseModel::Covariance(covariance)));
+    scan_number = std::max(scan_number, state.last_scan);
+  }
+  if (!factors.empty()) solver.Update(factors, values);
+  start_pose = T_map_lidar;
+  upright = snapshot.upright;
+}
+
+MapperResult Mapper::Impl::AddScanWhileLost(const MapperInput& input) {
+  MapperResult result = local->AddScan(input);
+  if (!result.warning.empty() && local->num_key_frames() > 0 && !buffer.empty() &&
+      input.stamp_ns <= buffer.back().stamp_ns) {
+    return result;
+  }
+  buffer.push_back(input);
+  if (static_cast<int>(buffer.size()) > config.relocalize_max_scans) {
+    buffer.clear();
+    local = std::make_unique<Mapper>(config);
+    tried_at_key_frame = 0;
+    result.warning = "the loaded map was not recognised in what was seen so far; starting the search anew";
+    return result;
+  }
+  result.warning = "the loaded map has not been recognised yet";
+  if (local->num_key_frames() < tried_at_key_frame + config.relocalize_every_key_frames) return result;
+  tried_at_key_frame = local->num_key_frames();
+
+  RelocalizerConfig search;
+  search.axis_deg = config.relocalize_axis_deg;
+  search.offset_m = config.relocalize_offset_m;
+  search.radius_ratio = config.relocalize_radius_ratio;
+  search.min_matches = config.relocalize_min_matches;
+  search.tilt_deg = config.relocalize_tilt_deg;
+  search.upright = pending->upright && local->Snapshot().upright;
+  TreeMap loaded(config.tree_map, config.radius_profile);
+  loaded.Restore(pending->landmarks, pending->next_landmark_id);
+  const std::optional<Relocalization> found =
+      Relocalize(local->Landmarks(), loaded.Landmarks(false), search);
+  if (!found) return result;
+
+  // Go through what was seen since the start once more, now on the loaded map.
+  const Eigen::Isometry3d start = found->T_map_local * local->Trajectory().front().T_map_lidar;
+  const std::vector<MapperInput> replay = std::move(buffer);
+  Impl fresh(config);
+  fresh.StartFrom(*pending, start);
+  for (const MapperInput& scan : replay) result = fresh.AddScan(scan);
+  *this = std::move(fresh);
+  return result;
+}
+
+std::vector<StampedPose> Mapper::Impl::Trajectory() const {
+  std::vector<StampedPose> out;
+  out.reserve(trajectory.size());
+  for (const TrajectoryEntry& entry : trajectory) {
+    const Eigen::Isometry3d& T = solver.Estimate<Eigen::Isometry3d>(PoseKey(entry.key_frame));
+    out.push_back({entry.stamp_ns, NormalizedSe3(T * entry.T_kf_lidar)});
+  }
+  return out;
+}
+
+std::vector<LandmarkState> Mapper::Impl::StatesWithMarginals() const {
+  std::vector<LandmarkState> states = map.states();
+  for (LandmarkState& state : states) {
+    const Key key = LandmarkKey(state.id);
+    if (!solver.Contains(key)) continue;
+    state.line = solver.Estimate<Cylinder>(key);
+    state.covariance = solver.MarginalCovariance(key);
+  }
+  return states;
+}
+
+Mapper::Mapper(MapperConfig config) {
+  config.Validate();
+  impl_ = std::make_unique<Impl>(config);
+}
+Mapper::~Mapper() = default;
+Mapper::Mapper(Mapper&&) noexcept = default;
+Mapper& Mapper::operator=(Mapper&&) noexcept = default;
+
+MapperResult Mapper::AddScan(const MapperInput& input) {
+  return impl_->pending ? impl_->AddScanWhileLost(input) : impl_->AddScan(input);
+}
+
+std::vector<Landmark> Mapper::Landmarks() const {
+  TreeMap map(impl_->config.tree_map, impl_->config.radius_profile);
+  if (impl_->pending) {
+    map.Restore(impl_->pending->landmarks, impl_->pending->next_landmark_id);
+  } else {
+    map.Restore(impl_->StatesWithMarginals(), impl_->map.next_id());
+  }
+  return map.Landmarks(false);
+}
+
+std::vector<Landmark> Mapper::AllLandmarks() const {
+  TreeMap map(impl_->config.tree_map, impl_->config.radius_profile);
+  if (impl_->pending) {
+    map.Restore(impl_->pending->landmarks, impl_->pending->next_landmark_id);
+  } else {
+    map.Restore(impl_->StatesWithMarginals(), impl_->map.next_id());
+  }
+  return map.Landmarks(true);
+}
+
+std::vector<StampedPose> Mapper::Trajectory() const {
+  return impl_->pending ? impl_->local->Trajectory() : impl_->Trajectory();
+}
+Eigen::Isometry3d Mapper::T_map_odom() const {
+  return impl_->pending ? impl_->local->T_map_odom() : impl_->T_map_odom;
+}
+int Mapper::num_key_frames() const {
+  return impl_->pending ? impl_->local->num_key_frames() : impl_->num_key_frames;
+}
+bool Mapper::relocalizing() const { return impl_->pending.has_value(); }
+
+MapSnapshot Mapper::Snapshot() const {
+  if (impl_->pending) return *impl_->pending;
+  return {impl_->map.next_id(), impl_->upright, impl_->StatesWithMarginals()};
+}
+
+void Mapper::Load(const MapSnapshot& snapshot) {
+  int previous = -1;
+  for (const LandmarkState& state : snapshot.landmarks) {
+    const std::string name = "MapSnapshot: landmark " + std::to_string(state.id);
+    if (state.id <= previous || state.id >= snapshot.next_landmark_id) {
+      throw std::invalid_argument(name + ": ids must ascend and stay below next_landmark_id");
+    }
+    previous = state.id;
+    if (!state.line.axis.allFinite() || std::abs(state.line.axis.norm() - 1.0) > 1e-3 ||
+        !state.line.point.allFinite() || !std::isfinite(state.line.curvature) ||
+        !(state.line.curvature > 0.0)) {
+      throw std::invalid_argument(name + ": its line is not a cylinder");
+    }
+    if (!IsPositiveDefinite(state.covariance)) {
+      throw std::invalid_argument(name + ": its covariance is not positive definite");
+    }
+    if (state.coverage.empty() || state.profile.knots().empty()) {
+      throw std::invalid_argument(name + ": it has no extent or no radius");
+    }
+  }
+  auto fresh = std::make_unique<Impl>(impl_->config);
+  if (!snapshot.landmarks.empty()) {
+    fresh->pending = snapshot;
+    fresh->local = std::make_unique<Mapper>(impl_->config);
+  } else {
+    fresh->map.Restore({}, snapshot.next_landmark_id);
+  }
+  impl_ = std::move(fresh);
+}
+
+void Mapper::Reset() { impl_ = std::make_unique<Impl>(impl_->config); }
+
+const MapperConfig& Mapper::config() const { return impl_->config; }
+
+}  // namespace dendro

@@ -1,0 +1,179 @@
+#include "dendro_slam/mapping/radius_profile.h"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
+namespace dendro {
+
+namespace {
+
+constexpr double kTwoPi = 6.283185307179586;
+
+void Require(bool ok, const char* message) {
+  if (!ok) throw std::invalid_argument(std::string("RadiusProfileConfig: ") + message);
+}
+
+int DistanceBin(double distance_m) {
+  if (distance_m < 3.0) return 0;
+  if (distance_m < 6.0) return 1;
+  return distance_m < 12.0 ? 2 : 3;
+}
+
+int DirectionBin(double angle, int bins) {
+  const double turn = angle / kTwoPi - std::floor(angle / kTwoPi);
+  return std::min(bins - 1, static_cast<int>(turn * bins));
+}
+
+struct Estimate {
+  double radius = 0.0;
+  double sigma = 0.0;
+};
+
+// Weighted mean of the bins' means; each bin's variance stops at what its scans share.
+Estimate Combine(const std::vector<RadiusProfile::Bin>& bins, const RadiusProfileConfig& config) {
+  double total = 0.0, weighted = 0.0;
+  for (const RadiusProfile::Bin& bin : bins) {
+    const double mean = bin.weighted_radius / bin.weight;
+    const double shared = config.bin_sigma_rel * mean;
+    const double variance =
+        1.0 / bin.weight + shared * shared + config.bin_sigma_m * config.bin_sigma_m;
+    total += 1.0 / variance;
+    weighted += mean / variance;
+  }
+  Estimate out;
+  out.radius = weighted / total;
+  // Bins that disagree by more than their sigmas say that the sigmas are too small.
+  double chi2 = 0.0;
+  for (const RadiusProfile::Bin& bin : bins) {
+    const double mean = bin.weighted_radius / bin.weight;
+    const double shared = config.bin_sigma_rel * mean;
+    const double variance =
+        1.0 / bin.weight + shared * shared + config.bin_sigma_m * config.bin_sigma_m;
+    chi2 += (mean - out.radius) * (mean - out.radius) / variance;
+  }
+  const double scale =
+      bins.size() > 1 ? std::max(1.0, chi2 / static_cast<double>(bins.size() - 1)) : 1.0;
+  const double common = config.common_sigma_rel * out.radius;
+  out.sigma = std::sqrt(scale / total + common * common);
+  return out;
+}
+
+}  // namespace
+
+void RadiusProfileConfig::Validate() const {
+  Require(knot_spacing_m > 0.0, "knot_spacing_m must be > 0");
+  Require(direction_bins >= 1 && direction_bins <= 36, "direction_bins must be in [1, 36]");
+  Require(bin_sigma_rel >= 0.0, "bin_sigma_rel must be >= 0");
+  Require(bin_sigma_m >= 0.0, "bin_sigma_m must be >= 0");
+  Require(common_sigma_rel >= 0.0, "common_sigma_rel must be >= 0");
+  Require(outlier_sigma > 0.0, "outlier_sigma must be > 0");
+}
+
+RadiusProfile::Knot& RadiusProfile::KnotAt(int index) {
+  auto it = std::lower_bound(knots_.begin(), knots_.end(), index, [](const Knot& knot, int i) {
+    return knot.index < i;
+  });
+  if (it == knots_.end() || it->index != index) {
+    it = knots_.insert(it, Knot{});
+    it->index = index;
+  }
+  return *it;
+}
+
+void RadiusProfile::Add(const Observation& o, const RadiusProfileConfig& config) {
+  const double spacing = config.knot_spacing_m;
+  int first = static_cast<int>(std::ceil(o.s_start_m / spacing));
+  int last = static_cast<int>(std::floor(o.s_end_m / spacing));
+  if (first > last) {
+    first = last = static_cast<int>(std::lround(0.5 * (o.s_start_m + o.s_end_m) / spacing));
+  }
+  const int bin_index = DirectionBin(o.view_angle_rad, config.direction_bins) * kDistanceBins +
+                        DistanceBin(o.distance_m);
+  for (int k = first; k <= last; ++k) {
+    const double ds = k * spacing - o.s_anchor_m;
+    const double radius = o.radius_m + o.taper_m_per_m * ds;
+    const double variance = o.radius_sigma_m * o.radius_sigma_m +
+                            o.taper_sigma_m_per_m * o.taper_sigma_m_per_m * ds * ds;
+    if (!(radius > 0.0) || !(variance > 0.0) || !std::isfinite(radius + variance)) continue;
+    Knot& knot = KnotAt(k);
+    double weight = 1.0 / variance;
+    if (knot.num_scans >= 5) {
+      const Estimate now = Combine(knot.bins, config);
+      const double shared = config.bin_sigma_rel * now.radius;
+      const double limit =
+          config.outlier_sigma * std::sqrt(variance + shared * shared + now.sigma * now.sigma);
+      const double difference = std::abs(radius - now.radius);
+      if (difference > limit) weight *= (limit / difference) * (limit / difference);
+    }
+    auto bin = std::lower_bound(
+        knot.bins.begin(), knot.bins.end(), bin_index, [](const Bin& b, int i) { return b.index < i; });
+    if (bin == knot.bins.end() || bin->index != bin_index) {
+      bin = knot.bins.insert(bin, Bin{});
+      bin->index = bin_index;
+    }
+    bin->weight += weight;
+    bin->weighted_radius += weight * radius;
+    ++bin->num_scans;
+    ++knot.num_scans;
+  }
+}
+
+std::vector<RadiusKnot> RadiusProfile::Knots(const RadiusProfileConfig& config) const {
+  std::vector<RadiusKnot> out;
+  out.reserve(knots_.size());
+  for (const Knot& knot : knots_) {
+    if (knot.bins.empty()) continue;
+    const Estimate estimate = Combine(knot.bins, config);
+    RadiusKnot k;
+    k.s_m = knot.index * config.knot_spacing_m;
+    k.radius_m = estimate.radius;
+    k.radius_sigma_m = estimate.sigma;
+    k.num_scans = knot.num_scans;
+    out.push_back(k);
+  }
+  return out;
+}
+
+void RadiusProfile::Merge(const RadiusProfile& other,
+                          double offset_m,
+                          bool same_sign,
+                          double turn_rad,
+                          const RadiusProfileConfig& config) {
+  const double sign = same_sign ? 1.0 : -1.0;
+  for (const Knot& knot : other.knots_) {
+    const double s = offset_m + sign * knot.index * config.knot_spacing_m;
+    Knot& mine = KnotAt(static_cast<int>(std::lround(s / config.knot_spacing_m)));
+    mine.num_scans += knot.num_scans;
+    for (const Bin& bin : knot.bins) {
+      const int direction = bin.index / kDistanceBins;
+      const double angle =
+          sign * (direction + 0.5) * kTwoPi / config.direction_bins + turn_rad;
+      const int index = DirectionBin(angle, config.direction_bins) * kDistanceBins +
+                        bin.index % kDistanceBins;
+      auto it = std::lower_bound(
+          mine.bins.begin(), mine.bins.end(), index, [](const Bin& b, int i) { return b.index < i; });
+      if (it == mine.bins.end() || it->index != index) {
+        it = mine.bins.insert(it, Bin{});
+        it->index = index;
+      }
+      it->weight += bin.weight;
+      it->weighted_radius += bin.weighted_radius;
+      it->num_scans += bin.num_scans;
+    }
+  }
+}
+
+void RadiusProfile::Crop(double s_begin_m, double s_end_m, const RadiusProfileConfig& config) {
+  const double slack = 0.5 * config.knot_spacing_m;
+  knots_.erase(std::remove_if(knots_.begin(),
+                              knots_.end(),
+                              [&](const Knot& knot) {
+                                const double s = knot.index * config.knot_spacing_m;
+                                return s < s_begin_m - slack || s > s_end_m + slack;
+                              }),
+               knots_.end());
+}
+
+}  // namespace dendro

@@ -1,0 +1,425 @@
+#include "dendro_slam/mapping/tree_map.h"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
+#include <Eigen/Cholesky>
+
+#include "dendro_slam/factor_graph/cylinder_factor.h"
+
+namespace dendro {
+
+namespace {
+
+constexpr double kTwoPi = 6.283185307179586;
+// Taper that an observation too short to show its own may have (a trunk's is about a per cent, a
+// branch's base or a buttress several) [m/m].
+constexpr double kUnknownTaperSigma = 0.02;
+
+void Require(bool ok, const char* message) {
+  if (!ok) throw std::invalid_argument(std::string("TreeMapConfig: ") + message);
+}
+
+// Direction from the axis to a point, as an angle in the axis' perpendicular basis.
+double AngleAround(const Cylinder& line, const Eigen::Vector3d& point) {
+  const Eigen::Vector2d d = PerpendicularBasis(line.axis).transpose() * (point - line.point);
+  return std::atan2(d.y(), d.x());
+}
+
+int CellOf(double s, double cell) { return static_cast<int>(std::floor(s / cell)); }
+
+// Counts the cells from s_begin to s_end once.
+void Cover(LandmarkState* state, double s_begin, double s_end, double cell) {
+  const int first = CellOf(s_begin, cell);
+  const int last = std::max(first, CellOf(s_end - 1e-9, cell));
+  if (state->coverage.empty()) state->first_cell = first;
+  if (first < state->first_cell) {
+    state->coverage.insert(
+        state->coverage.begin(), static_cast<std::size_t>(state->first_cell - first), 0);
+    state->first_cell = first;
+  }
+  const std::size_t needed = static_cast<std::size_t>(last - state->first_cell + 1);
+  if (state->coverage.size() < needed) state->coverage.resize(needed, 0);
+  for (int k = first; k <= last; ++k) ++state->coverage[static_cast<std::size_t>(k - state->first_cell)];
+}
+
+struct Extent {
+  double begin = 0.0, end = 0.0;
+};
+
+// From the first to the last cell with enough support. A tip is seen from fewer places than a
+// middle, so the support wanted is a small share of the densest cell's.
+Extent ExtentOf(const LandmarkState& state, const TreeMapConfig& config) {
+  int densest = 0;
+  for (int count : state.coverage) densest = std::max(densest, count);
+  const int wanted = std::clamp(
+      static_cast<int>(std::ceil(config.end_support * densest)), std::min(densest, 3), densest);
+  int first = -1, last = -1;
+  for (int k = 0; k < static_cast<int>(state.coverage.size()); ++k) {
+    if (state.coverage[static_cast<std::size_t>(k)] < wanted) continue;
+    if (first < 0) first = k;
+    last = k;
+  }
+  Extent out;
+  if (first < 0) return out;
+  out.begin = (state.first_cell + first) * config.coverage_cell_m;
+  out.end = (state.first_cell + last + 1) * config.coverage_cell_m;
+  return out;
+}
+
+Landmark Summarize(const LandmarkState& state,
+                   const TreeMapConfig& config,
+                   const RadiusProfileConfig& profile_config) {
+  const Extent extent = ExtentOf(state, config);
+  const double middle = 0.5 * (extent.begin + extent.end);
+  Landmark out;
+  out.id = state.id;
+  out.cylinder = state.line.Slid(middle);
+  const Matrix5d J = CylinderSlideJacobian(state.line, middle);
+  out.covariance = J * state.covariance * J.transpose();
+  out.s_min_m = extent.begin - middle;
+  out.s_max_m = extent.end - middle;
+  out.s_min_sigma_m = out.s_max_sigma_m = state.end_sigma_m;
+  RadiusProfile cropped = state.profile;
+  cropped.Crop(extent.begin, extent.end, profile_config);
+  out.profile = cropped.Knots(profile_config);
+  if (out.profile.empty()) out.profile = state.profile.Knots(profile_config);
+  for (RadiusKnot& knot : out.profile) knot.s_m -= middle;
+  const double radius = out.RadiusAt(0.0);
+  out.cylinder.curvature = 1.0 / radius;
+  // The radius is the profile's business; the graph's curvature only helps the lines.
+  const double sigma = out.RadiusSigmaAt(0.0) / (radius * radius);
+  out.covariance.row(4).setZero();
+  out.covariance.col(4).setZero();
+  out.covariance(4, 4) = sigma * sigma;
+  out.num_scans = state.num_scans;
+  out.num_points = state.num_points;
+  out.arc_seen = state.arc_seen;
+  out.mean_abs_deviation_m = state.num_scans > 0 ? state.deviation_sum_m / state.num_scans : 0.0;
+  out.confirmed = state.confirmed;
+  return out;
+}
+
+}  // namespace
+
+void TreeMapConfig::Validate() const {
+  Require(confirm_scans >= 1, "confirm_scans must be >= 1");
+  Require(confirm_ratio >= 0.0 && confirm_ratio <= 1.0, "confirm_ratio must be in [0, 1]");
+  Require(confirm_radius_sigma_rel > 0.0, "confirm_radius_sigma_rel must be > 0");
+  Require(candidate_max_gap_scans >= 1, "candidate_max_gap_scans must be >= 1");
+  Require(max_length_m > 0.0, "max_length_m must be > 0");
+  Require(coverage_cell_m > 0.0, "coverage_cell_m must be > 0");
+  Require(end_support > 0.0 && end_support <= 1.0, "end_support must be in (0, 1]");
+  Require(min_gap_m > 0.0, "min_gap_m must be > 0");
+  Require(gap_support >= 0.0 && gap_support < 1.0, "gap_support must be in [0, 1)");
+  Require(gap_min_scans >= 1, "gap_min_scans must be >= 1");
+  Require(merge_gate_sigma > 0.0, "merge_gate_sigma must be > 0");
+  Require(std::isfinite(merge_min_overlap), "merge_min_overlap must be finite");
+}
+
+TreeMap::TreeMap(TreeMapConfig config, RadiusProfileConfig profile_config)
+    : config_(config), profile_config_(profile_config) {
+  config_.Validate();
+  profile_config_.Validate();
+}
+
+LandmarkState* TreeMap::Find(int id) {
+  auto it = std::lower_bound(states_.begin(), states_.end(), id, [](const LandmarkState& s, int i) {
+    return s.id < i;
+  });
+  return it != states_.end() && it->id == id ? &*it : nullptr;
+}
+
+const LandmarkState* TreeMap::Find(int id) const { return const_cast<TreeMap*>(this)->Find(id); }
+
+bool TreeMap::Has(int id) const { return Find(id) != nullptr; }
+
+const LandmarkState& TreeMap::State(int id) const {
+  const LandmarkState* state = Find(id);
+  if (state == nullptr) {
+    throw std::invalid_argument("TreeMap: no landmark with id " + std::to_string(id));
+  }
+  return *state;
+}
+
+int TreeMap::Add(const FittedCylinder& observation,
+                 const Eigen::Isometry3d& T_map_lidar,
+                 std::int64_t scan_number) {
+  LandmarkState state;
+  state.id = next_id_++;
+  state.line = TransformCylinder(T_map_lidar, observation.cylinder);
+  // A sign for people; from now on it is this landmark's own.
+  const Eigen::Vector3d axis = DisplayAxis(state.line.axis);
+  const Matrix5d J = CylinderTangentTransform(T_map_lidar, observation.cylinder);
+  Matrix5d covariance = J * observation.covariance * J.transpose();
+  if (axis.dot(state.line.axis) < 0.0) {
+    Matrix5d flip = Matrix5d::Identity();
+    const Eigen::Matrix2d M =
+        PerpendicularBasis(axis).transpose() * PerpendicularBasis(state.line.axis);
+    flip.topLeftCorner<2, 2>() = M;
+    flip.block<2, 2>(2, 2) = M;
+    covariance = flip * covariance * flip.transpose();
+  }
+  state.line.axis = axis;
+  state.covariance = covariance;
+  state.first_scan = scan_number;
+  states_.push_back(std::move(state));
+  Observe(states_.back().id, observation, T_map_lidar, scan_number);
+  return states_.back().id;
+}
+
+void TreeMap::Observe(int id,
+                      const FittedCylinder& observation,
+                      const Eigen::Isometry3d& T_map_lidar,
+                      std::int64_t scan_number) {
+  LandmarkState* state = Find(id);
+  if (state == nullptr) return;
+  const Cylinder in_map = TransformCylinder(T_map_lidar, observation.cylinder);
+  const double sign = in_map.axis.dot(state->line.axis) < 0.0 ? -1.0 : 1.0;
+  const double s = (in_map.point - state->line.point).dot(state->line.axis);
+  const double a = s + sign * observation.start_s_m;
+  const double b = s + sign * observation.end_s_m;
+
+  RadiusProfile::Observation o;
+  o.s_start_m = std::min(a, b);
+  o.s_end_m = std::max(a, b);
+  o.s_anchor_m = s;
+  o.radius_m = observation.cylinder.radius();
+  o.radius_sigma_m = observation.radius_sigma_m();
+  if (observation.taper_estimated) {
+    o.taper_m_per_m = sign * observation.taper_m_per_m;
+    o.taper_sigma_m_per_m = observation.taper_sigma_m_per_m;
+  } else {
+    o.taper_sigma_m_per_m = kUnknownTaperSigma;
+  }
+  o.view_angle_rad = AngleAround(state->line, T_map_lidar.translation());
+  o.distance_m = observation.distance_m;
+  state->profile.Add(o, profile_config_);
+
+  Cover(state, o.s_start_m, o.s_end_m, config_.coverage_cell_m);
+  state->end_sigma_m = (state->end_sigma_m * state->num_scans + observation.end_sigma_m) /
+                       (state->num_scans + 1);
+  if (state->num_scans == 0 || state->last_scan != scan_number) ++state->num_scans;
+  state->num_points += observation.num_points;
+  state->deviation_sum_m += observation.mean_abs_deviation_m;
+  // The arc with returns is centred on the viewing direction.
+  const double half = 0.5 * observation.visible_arc_rad;
+  const double bin = kTwoPi / Landmark::kArcBins;
+  for (double angle = o.view_angle_rad - half; angle <= o.view_angle_rad + half + 1e-9;
+       angle += std::max(1e-3, std::min(bin, half > 0.0 ? half : bin))) {
+    const double turn = angle / kTwoPi - std::floor(angle / kTwoPi);
+    state->arc_seen.set(std::min<std::size_t>(Landmark::kArcBins - 1,
+                                              static_cast<std::size_t>(turn * Landmark::kArcBins)));
+  }
+  state->last_scan = scan_number;
+}
+
+void TreeMap::SetLine(int id, const Cylinder& line, const Matrix5d& covariance) {
+  LandmarkState* state = Find(id);
+  if (state == nullptr) return;
+  state->line = line;
+  state->covariance = covariance;
+}
+
+std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
+  std::vector<int> drop;
+  for (LandmarkState& state : states_) {
+    if (state.confirmed) continue;
+    if (scan_number - state.last_scan > config_.candidate_max_gap_scans) {
+      drop.push_back(state.id);
+      continue;
+    }
+    if (state.num_scans < config_.confirm_scans) continue;
+    const double span = static_cast<double>(state.last_scan - state.first_scan + 1);
+    if (state.num_scans < config_.confirm_ratio * span) continue;
+    double best = 1e9;
+    for (const RadiusKnot& knot : state.profile.Knots(profile_config_)) {
+      best = std::min(best, knot.radius_sigma_m / knot.radius_m);
+    }
+    if (best > config_.confirm_radius_sigma_rel) continue;
+    state.confirmed = true;
+  }
+  return drop;
+}
+
+void TreeMap::Remove(int id) {
+  states_.erase(std::remove_if(states_.begin(),
+                               states_.end(),
+                               [id](const LandmarkState& state) { return state.id == id; }),
+                states_.end());
+}
+
+std::optional<LandmarkMerge> TreeMap::FindDuplicate(
+    const DataAssociationConfig& association) const {
+  std::vector<Landmark> summaries;
+  summaries.reserve(states_.size());
+  for (const LandmarkState& state : states_) {
+    summaries.push_back(Summarize(state, config_, profile_config_));
+  }
+  DataAssociationConfig gates = association;
+  gates.gate_sigma = config_.merge_gate_sigma;
+  for (std::size_t i = 0; i < summaries.size(); ++i) {
+    const Landmark& a = summaries[i];
+    for (std::size_t j = i + 1; j < summaries.size(); ++j) {
+      const Landmark& b = summaries[j];
+      if (!a.confirmed && !b.confirmed) continue;
+      if (std::abs(a.cylinder.axis.dot(b.cylinder.axis)) < 0.97) continue;
+      FittedCylinder as_observation;
+      as_observation.status = FitStatus::kMeasured;
+      as_observation.cylinder = b.cylinder;
+      as_observation.covariance = b.covariance;
+      as_observation.start_s_m = b.s_min_m;
+      as_observation.end_s_m = b.s_max_m;
+      const LineResidual r = ComputeLineResidual(
+          as_observation, a, Eigen::Isometry3d::Identity(), Matrix6d::Zero(), gates);
+      const double shorter = std::min(a.s_max_m - a.s_min_m, b.s_max_m - b.s_min_m);
+      if (r.overlap_m < std::min(config_.merge_min_overlap, shorter)) continue;
+      if (r.offset_m > 0.5 * std::max(r.landmark_radius_m, r.radius_m) +
+                           association.offset_sigma_floor_m) {
+        continue;
+      }
+      const double ratio =
+          std::max(r.radius_m / r.landmark_radius_m, r.landmark_radius_m / r.radius_m);
+      if (ratio > association.max_radius_ratio) continue;
+      const double merged_length =
+          (a.s_max_m - a.s_min_m) + (b.s_max_m - b.s_min_m) - std::max(0.0, r.overlap_m);
+      if (merged_length > config_.max_length_m) continue;
+      const double mahalanobis2 = r.residual.dot(r.covariance.ldlt().solve(r.residual));
+      const double gate = config_.merge_gate_sigma * config_.merge_gate_sigma + 4.0;
+      if (!(mahalanobis2 <= gate)) continue;
+      // A confirmed landmark is kept before a candidate, the older before the younger.
+      const bool swap = b.confirmed && !a.confirmed;
+      return swap ? LandmarkMerge{b.id, a.id} : LandmarkMerge{a.id, b.id};
+    }
+  }
+  return std::nullopt;
+}
+
+void TreeMap::Merge(const LandmarkMerge& merge) {
+  LandmarkState* keep = Find(merge.keep_id);
+  const LandmarkState* drop = Find(merge.drop_id);
+  if (keep == nullptr || drop == nullptr || keep == drop) return;
+  const bool same_sign = keep->line.axis.dot(drop->line.axis) >= 0.0;
+  const double offset = (drop->line.point - keep->line.point).dot(keep->line.axis);
+  // Where the other's zero of the angle lies in this basis.
+  const Eigen::Vector3d zero = PerpendicularBasis(drop->line.axis).col(0);
+  const Eigen::Vector2d turned = PerpendicularBasis(keep->line.axis).transpose() * zero;
+  const double turn = std::atan2(turned.y(), turned.x());
+  keep->profile.Merge(drop->profile, offset, same_sign, turn, profile_config_);
+  const double cell = config_.coverage_cell_m;
+  for (std::size_t k = 0; k < drop->coverage.size(); ++k) {
+    if (drop->coverage[k] == 0) continue;
+    const double middle = (drop->first_cell + static_cast<int>(k) + 0.5) * cell;
+    const double s = offset + (same_sign ? middle : -middle);
+    const int target = CellOf(s, cell);
+    Cover(keep, (target + 0.25) * cell, (target + 0.75) * cell, cell);
+    keep->coverage[static_cast<std::size_t>(target - keep->first_cell)] += drop->coverage[k] - 1;
+  }
+  for (int k = 0; k < Landmark::kArcBins; ++k) {
+    if (!drop->arc_seen[static_cast<std::size_t>(k)]) continue;
+    const double angle =
+        (same_sign ? 1.0 : -1.0) * (k + 0.5) * kTwoPi / Landmark::kArcBins + turn;
+    const double t = angle / kTwoPi - std::floor(angle / kTwoPi);
+    keep->arc_seen.set(std::min<std::size_t>(Landmark::kArcBins - 1,
+                                             static_cast<std::size_t>(t * Landmark::kArcBins)));
+  }
+  const int scans = keep->num_scans + drop->num_scans;
+  keep->end_sigma_m =
+      (keep->end_sigma_m * keep->num_scans + drop->end_sigma_m * drop->num_scans) /
+      std::max(1, scans);
+  keep->num_scans = scans;
+  keep->num_points += drop->num_points;
+  keep->deviation_sum_m += drop->deviation_sum_m;
+  keep->first_scan = std::min(keep->first_scan, drop->first_scan);
+  keep->last_scan = std::max(keep->last_scan, drop->last_scan);
+  keep->confirmed = keep->confirmed || drop->confirmed;
+  Remove(merge.drop_id);
+}
+
+std::optional<LandmarkSplit> TreeMap::FindSplit() const {
+  for (const LandmarkState& state : states_) {
+    const int n = static_cast<int>(state.coverage.size());
+    if (n < 3) continue;
+    const Extent extent = ExtentOf(state, config_);
+    // Densest cell on the left of and including k; then the same from the right.
+    std::vector<int> right(static_cast<std::size_t>(n) + 1, 0);
+    for (int k = n - 1; k >= 0; --k) {
+      right[static_cast<std::size_t>(k)] =
+          std::max(right[static_cast<std::size_t>(k) + 1], state.coverage[static_cast<std::size_t>(k)]);
+    }
+    int left = 0;
+    int gap_first = -1;
+    for (int k = 0; k < n; ++k) {
+      const int count = state.coverage[static_cast<std::size_t>(k)];
+      const int sides = std::min(left, right[static_cast<std::size_t>(k) + 1]);
+      const bool low = sides >= config_.gap_min_scans && count < config_.gap_support * sides;
+      if (low && gap_first < 0) gap_first = k;
+      if (!low && gap_first >= 0) {
+        const double begin = (state.first_cell + gap_first) * config_.coverage_cell_m;
+        const double end = (state.first_cell + k) * config_.coverage_cell_m;
+        if (end - begin >= config_.min_gap_m && begin > extent.begin && end < extent.end) {
+          return LandmarkSplit{state.id, begin, end};
+        }
+        gap_first = -1;
+      }
+      left = std::max(left, count);
+    }
+  }
+  return std::nullopt;
+}
+
+std::pair<int, bool> TreeMap::Split(const LandmarkSplit& split) {
+  LandmarkState* state = Find(split.landmark_id);
+  if (state == nullptr) {
+    throw std::invalid_argument("TreeMap: no landmark with id " + std::to_string(split.landmark_id));
+  }
+  const double cell = config_.coverage_cell_m;
+  const double middle = 0.5 * (split.gap_begin_m + split.gap_end_m);
+  LandmarkState below = *state, above = *state;
+  const int cut = CellOf(middle, cell) - state->first_cell;
+  below.coverage.resize(static_cast<std::size_t>(std::max(0, cut)));
+  above.coverage.erase(above.coverage.begin(), above.coverage.begin() + std::max(0, cut));
+  above.first_cell = state->first_cell + std::max(0, cut);
+  below.profile.Crop(-1e9, split.gap_begin_m, profile_config_);
+  above.profile.Crop(split.gap_end_m, 1e9, profile_config_);
+  const auto densest = [](const std::vector<int>& coverage) {
+    int most = 0;
+    for (int count : coverage) most = std::max(most, count);
+    return most;
+  };
+  const int scans_below = densest(below.coverage), scans_above = densest(above.coverage);
+  below.num_scans = std::min(state->num_scans, scans_below);
+  above.num_scans = std::min(state->num_scans, scans_above);
+  const double share =
+      static_cast<double>(scans_below) / std::max(1, scans_below + scans_above);
+  below.num_points = static_cast<int>(state->num_points * share);
+  above.num_points = state->num_points - below.num_points;
+  below.deviation_sum_m = state->deviation_sum_m * below.num_scans / std::max(1, state->num_scans);
+  above.deviation_sum_m = state->deviation_sum_m * above.num_scans / std::max(1, state->num_scans);
+  const bool new_is_above = scans_below >= scans_above;
+  LandmarkState& fresh = new_is_above ? above : below;
+  fresh.id = next_id_++;
+  const int fresh_id = fresh.id;
+  *state = new_is_above ? below : above;
+  states_.push_back(new_is_above ? std::move(above) : std::move(below));
+  return {fresh_id, new_is_above};
+}
+
+Landmark TreeMap::Summary(int id) const { return Summarize(State(id), config_, profile_config_); }
+
+std::vector<Landmark> TreeMap::Landmarks(bool with_candidates) const {
+  std::vector<Landmark> out;
+  for (const LandmarkState& state : states_) {
+    if (state.confirmed || with_candidates) out.push_back(Summarize(state, config_, profile_config_));
+  }
+  return out;
+}
+
+void TreeMap::Restore(std::vector<LandmarkState> states, int next_id) {
+  states_ = std::move(states);
+  next_id_ = next_id;
+}
+
+}  // namespace dendro

@@ -1,0 +1,172 @@
+// Scores stage 1 on simulated scans of scenes that were never trained on: per kind of scene and
+// range, with the time per scan; network and geometric fallback by the same scorer.
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <exception>
+#include <iostream>
+#include <map>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include <CLI/CLI.hpp>
+#include <nlohmann/json.hpp>
+
+#include "dendro_slam/segmentation/wood_segmenter.h"
+#include "dendro_slam/sim/training_scans.h"
+
+namespace {
+
+using dendro::Label;
+
+struct Options {
+  int scans_per_kind = 20;
+  int scans_per_scene = 4;
+  std::uint64_t seed = 5000000;
+  std::string methods = "network,geometric";
+  std::string weights;
+  std::string kinds = "thesis,leafless,leafy,tilted";
+  int sub_rays_width = 8;
+  int sub_rays_height = 3;
+  dendro::ProjectorConfig projector;
+};
+
+std::vector<std::string> Split(const std::string& text) {
+  std::vector<std::string> words;
+  std::string word;
+  std::istringstream stream(text);
+  while (std::getline(stream, word, ',')) words.push_back(word);
+  return words;
+}
+
+struct Counts {
+  double both = 0, either = 0, truth = 0, guess = 0, right = 0, total = 0;
+
+  void Add(Label label, Label expected) {
+    const bool wood = expected == Label::kWood;
+    const bool found = label == Label::kWood;
+    both += wood && found;
+    either += wood || found;
+    truth += wood;
+    guess += found;
+    right += label == expected;
+    total += 1;
+  }
+  nlohmann::json Json() const {
+    const auto ratio = [](double a, double b) -> nlohmann::json {
+      if (b <= 0) return nullptr;
+      return std::round(a / b * 1e4) / 1e4;
+    };
+    return {{"wood_iou", ratio(both, either)}, {"accuracy", ratio(right, total)},
+            {"wood_recall", ratio(both, truth)}, {"wood_precision", ratio(both, guess)},
+            {"wood_pixels", truth}};
+  }
+};
+
+const std::array<float, 5> kRangeEdges = {0.0F, 4.0F, 8.0F, 16.0F, 200.0F};
+
+struct Score {
+  Counts all;
+  std::array<Counts, 4> by_range;
+  std::vector<double> milliseconds;
+
+  nlohmann::json Json() {
+    nlohmann::json json = all.Json();
+    for (std::size_t i = 0; i < by_range.size(); ++i) {
+      std::ostringstream name;
+      name << kRangeEdges[i] << "-" << kRangeEdges[i + 1] << "m";
+      json["by_range"][name.str()] = by_range[i].Json();
+    }
+    std::sort(milliseconds.begin(), milliseconds.end());
+    const std::size_t n = milliseconds.size();
+    json["ms_median"] = milliseconds[n / 2];
+    json["ms_p95"] = milliseconds[std::min(n - 1, n * 95 / 100)];
+    json["scans"] = n;
+    return json;
+  }
+};
+
+void Run(const Options& options) {
+  std::vector<std::pair<std::string, dendro::WoodSegmenter>> segmenters;
+  for (const std::string& method : Split(options.methods)) {
+    dendro::WoodSegmenterConfig config;
+    config.method = method;
+    config.weights = options.weights;
+    segmenters.emplace_back(method, dendro::WoodSegmenter(config));
+  }
+  dendro::LidarSimulatorConfig lidar;
+  lidar.sub_rays_width = options.sub_rays_width;
+  lidar.sub_rays_height = options.sub_rays_height;
+  const bool progress = isatty(STDERR_FILENO) != 0;
+  std::map<std::string, std::map<std::string, Score>> scores;
+  for (const std::string& kind : Split(options.kinds)) {
+    int done = 0;
+    for (std::uint64_t scene = 0; done < options.scans_per_kind; ++scene) {
+      const int count = std::min(options.scans_per_scene, options.scans_per_kind - done);
+      for (const dendro::TrainingScan& scan : dendro::SimulateTrainingScans(
+               kind, options.seed + scene, count, lidar, options.projector)) {
+        for (auto& [method, segmenter] : segmenters) {
+          dendro::RangeImage image = scan.image;
+          const auto start = std::chrono::steady_clock::now();
+          const dendro::LabelledScan result = segmenter.Segment(std::move(image));
+          const std::chrono::duration<double, std::milli> time =
+              std::chrono::steady_clock::now() - start;
+          Score& score = scores[method][kind];
+          score.milliseconds.push_back(time.count());
+          for (std::size_t i = 0; i < scan.truth.size(); ++i) {
+            if (scan.truth[i] == Label::kNone) continue;
+            score.all.Add(result.label[i], scan.truth[i]);
+            for (std::size_t k = 0; k < score.by_range.size(); ++k) {
+              const float range = result.image.range[i];
+              if (range >= kRangeEdges[k] && range < kRangeEdges[k + 1]) {
+                score.by_range[k].Add(result.label[i], scan.truth[i]);
+              }
+            }
+          }
+        }
+        ++done;
+      }
+      if (progress) {
+        std::fprintf(stderr, "\r%-10s %d of %d scans", kind.c_str(), done, options.scans_per_kind);
+      }
+    }
+  }
+  if (progress) std::fprintf(stderr, "\n");
+  nlohmann::json json;
+  for (auto& [method, kinds] : scores) {
+    for (auto& [kind, score] : kinds) json[method][kind] = score.Json();
+  }
+  std::cout << json.dump(1) << "\n";
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  Options options;
+  CLI::App app("Scores the wood segmentation on simulated scans; prints one JSON object.");
+  app.add_option("--scans", options.scans_per_kind, "Per kind of scene")->check(CLI::Range(1, 100000));
+  app.add_option("--scans-per-scene", options.scans_per_scene)->check(CLI::Range(1, 1000));
+  app.add_option("--seed", options.seed, "Of the first scene; training uses 1000 and 900000 upwards");
+  app.add_option("--methods", options.methods, "network, geometric or both, with a comma");
+  app.add_option("--weights", options.weights, "Weights file; default: the shipped one");
+  app.add_option("--kinds", options.kinds);
+  app.add_option("--sub-rays-width", options.sub_rays_width)->check(CLI::Range(1, 64));
+  app.add_option("--sub-rays-height", options.sub_rays_height)->check(CLI::Range(1, 64));
+  app.add_option("--model", options.projector.model, "vlp16 or uniform");
+  app.add_option("--rows", options.projector.rows);
+  app.add_option("--cols", options.projector.cols);
+  CLI11_PARSE(app, argc, argv);
+  try {
+    Run(options);
+  } catch (const std::exception& error) {
+    std::cerr << "score_segmentation: " << error.what() << "\n";
+    return 1;
+  }
+  return 0;
+}
