@@ -592,9 +592,15 @@ void Raycaster::CastBundle(const RayBundle& bundle,
     throw std::invalid_argument("RayBundle: origins and directions must agree, at most 256 sub-rays");
   }
   double farthest = 0.0;
+  double ground_from = 0.0;
+  if (impl.rough) {
+    // One walk along the central ray tells how far every sub-ray is above the rough ground.
+    impl.rough->Intersect(bundle.origin, bundle.direction, 0.0, max_range_m, bundle.half_width_m,
+                          1.01 * bundle.half_angle_rad, &ground_from);
+  }
   for (std::size_t i = 0; i < n; ++i) {
     best[i] = Best();
-    best[i].range_m = impl.TestGround(bundle.origins[i], bundle.directions[i], 0.0, max_range_m);
+    best[i].range_m = impl.TestGround(bundle.origins[i], bundle.directions[i], ground_from, max_range_m);
     best[i].is_ground = best[i].range_m < kNoHit;
     farthest = std::max(farthest, std::min(best[i].range_m, max_range_m));
   }

@@ -18,11 +18,13 @@ RoughGround::RoughGround(const SceneGround& ground)
     waves_[i] = {k * std::cos(direction), k * std::sin(direction), rng.Uniform(0.0, 2.0 * M_PI),
                  wavelength};
     sum += wavelength;
-    wavelength *= 0.62;
+    wavelength *= 0.55;
   }
   for (Wave& wave : waves_) {
     wave.amplitude *= amplitude_m_ / sum;
-    slope_bound_ += wave.amplitude * std::hypot(wave.kx, wave.ky);
+    const double k = std::hypot(wave.kx, wave.ky);
+    slope_bound_ += wave.amplitude * k;
+    curvature_bound_ += wave.amplitude * k * k;
   }
 }
 
@@ -45,7 +47,11 @@ Eigen::Vector3d RoughGround::Normal(double x, double y) const {
 std::optional<double> RoughGround::Intersect(const Eigen::Vector3d& origin,
                                              const Eigen::Vector3d& direction,
                                              double min_range_m,
-                                             double max_range_m) const {
+                                             double max_range_m,
+                                             double half_width_m,
+                                             double half_angle_rad,
+                                             double* safe_m) const {
+  if (safe_m != nullptr) *safe_m = min_range_m;
   // Only the slab that can hold the surface matters.
   double from = min_range_m, to = max_range_m;
   const double top = z_m_ + amplitude_m_, bottom = z_m_ - amplitude_m_;
@@ -63,29 +69,44 @@ std::optional<double> RoughGround::Intersect(const Eigen::Vector3d& origin,
     return std::nullopt;
   }
   if (from > to) return std::nullopt;
-  const auto gap = [&](double t) {
-    const Eigen::Vector3d p = origin + t * direction;
-    return p.z() - Height(p.x(), p.y());
+  // Gap between ray and surface, and its derivative along the ray.
+  double gap = 0.0, slope = 0.0;
+  const auto evaluate = [&](double t) {
+    const double x = origin.x() + t * direction.x(), y = origin.y() + t * direction.y();
+    double height = z_m_;
+    slope = direction.z();
+    for (const Wave& w : waves_) {
+      const double phase = w.kx * x + w.ky * y + w.phase;
+      height += w.amplitude * std::sin(phase);
+      slope -= w.amplitude * std::cos(phase) * (w.kx * direction.x() + w.ky * direction.y());
+    }
+    gap = origin.z() + t * direction.z() - height;
   };
-  // Along the ray the gap changes by at most this per metre, so a step of gap / bound cannot pass
-  // the surface.
+  // Two steps that cannot pass the surface: by the bound of the slope, and by the bound of the
+  // curvature, gap + slope s - K s^2 / 2 > 0, which converges as fast as Newton's method.
   const double horizontal = std::hypot(direction.x(), direction.y());
-  const double bound = std::abs(direction.z()) + slope_bound_ * horizontal;
-  constexpr double kTolerance = 1e-6;
+  const double rate = std::abs(direction.z()) + slope_bound_ * horizontal;
+  const double curvature = curvature_bound_ * horizontal * horizontal + 1e-12;
+  constexpr double kTolerance = 1e-8;
   double t = from;
-  double g = gap(t);
-  const double sign = g >= 0.0 ? 1.0 : -1.0;  // From below, the surface is met from its other side.
+  evaluate(t);
+  const double sign = gap >= 0.0 ? 1.0 : -1.0;  // From below, the surface is met from its other side.
+  bool safe = sign > 0.0;
   for (int i = 0; i < 100000; ++i) {
-    const double distance = sign * g;
+    const double distance = sign * gap, descent = sign * slope;
+    if (safe_m != nullptr && safe) {
+      safe = distance > (half_width_m + half_angle_rad * t) * (1.0 + slope_bound_);
+      if (safe) *safe_m = t;
+    }
     if (distance <= kTolerance) return t;
-    const double step = std::max(distance / bound, kTolerance);
-    t += step;
+    const double by_curvature = (descent + std::sqrt(descent * descent + 2.0 * curvature * distance)) / curvature;
+    t += std::max({distance / rate, by_curvature, 10.0 * kTolerance});
     if (t > to) {
-      t = to;
-      if (sign * gap(t) <= kTolerance) return t;
+      evaluate(to);
+      if (sign * gap <= kTolerance) return to;
       return std::nullopt;
     }
-    g = gap(t);
+    evaluate(t);
   }
   return std::nullopt;
 }

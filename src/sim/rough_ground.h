@@ -10,8 +10,8 @@
 namespace dendro {
 
 /// A rough ground: a sum of plane waves with seeded directions and phases, from the longest
-/// wavelength down by factors of 0.62, amplitudes in proportion to wavelength. The height stays
-/// within the amplitude and its slope below a known bound, so a ray can be marched safely.
+/// wavelength down by factors of 0.55, amplitudes in proportion to wavelength. The height stays
+/// within the amplitude, its slope and curvature below known bounds, so a ray can be marched safely.
 class RoughGround {
  public:
   explicit RoughGround(const SceneGround& ground);
@@ -20,19 +20,26 @@ class RoughGround {
   Eigen::Vector3d Normal(double x, double y) const;
 
   /// Range of the first point of the ray at or below the surface, within [min, max].
+  /// @param half_width_m, half_angle_rad  Every ray that starts within the half width of this one and
+  ///                      deviates by less than the half angle is still above the surface ...
+  /// @param safe_m        ... up to this range (when asked for).
   std::optional<double> Intersect(const Eigen::Vector3d& origin,
                                   const Eigen::Vector3d& direction,
                                   double min_range_m,
-                                  double max_range_m) const;
+                                  double max_range_m,
+                                  double half_width_m = 0.0,
+                                  double half_angle_rad = 0.0,
+                                  double* safe_m = nullptr) const;
 
  private:
-  static constexpr int kWaves = 7;
+  static constexpr int kWaves = 5;
   struct Wave {
     double kx, ky, phase, amplitude;
   };
   double z_m_;
   double amplitude_m_;
-  double slope_bound_ = 0.0;
+  double slope_bound_ = 0.0;      ///< Of the height along any horizontal direction.
+  double curvature_bound_ = 0.0;  ///< Of the height along any horizontal direction [1/m].
   std::array<Wave, kWaves> waves_;
 };
 
