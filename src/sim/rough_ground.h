@@ -33,14 +33,16 @@ class RoughGround {
 
  private:
   static constexpr int kWaves = 5;
-  struct Wave {
-    double kx, ky, phase, amplitude;
-  };
+  static constexpr int kLanes = 6;  ///< Waves with one of no amplitude: an even number for the loops.
+
+  /// Height of the surface and its derivative along a horizontal direction (need not be unit).
+  void Evaluate(double x, double y, double dx, double dy, double* height, double* slope) const;
+
+  alignas(16) std::array<double, kLanes> kx_{}, ky_{}, phase_{}, wave_amplitude_{};
   double z_m_;
   double amplitude_m_;
   double slope_bound_ = 0.0;      ///< Of the height along any horizontal direction.
   double curvature_bound_ = 0.0;  ///< Of the height along any horizontal direction [1/m].
-  std::array<Wave, kWaves> waves_;
 };
 
 }  // namespace dendro
