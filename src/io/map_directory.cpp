@@ -112,7 +112,7 @@ void MakeDirectory(const std::string& directory) {
 
 double Finite(double value, const char* what, int id) {
   if (!std::isfinite(value)) {
-    throw MapFileError(fmt::format("the map is not saved: {} of {} is not finite", what, id));
+    throw MapFileError(fmt::format("the map is not saved: {} {} is not finite", what, id));
   }
   return value;
 }
@@ -142,9 +142,9 @@ Json LandmarkJson(const Landmark& landmark) {
   j["s_max_sigma_m"] = finite(landmark.s_max_sigma_m, "s_max_sigma_m of landmark");
   j["profile"] = Json::array();
   for (const RadiusKnot& knot : landmark.profile) {
-    j["profile"].push_back({{"s_m", finite(knot.s_m, "the profile of landmark")},
-                            {"radius_m", finite(knot.radius_m, "the profile of landmark")},
-                            {"radius_sigma_m", finite(knot.radius_sigma_m, "the profile of landmark")},
+    j["profile"].push_back({{"s_m", finite(knot.s_m, "the radius profile of landmark")},
+                            {"radius_m", finite(knot.radius_m, "the radius profile of landmark")},
+                            {"radius_sigma_m", finite(knot.radius_sigma_m, "the radius profile of landmark")},
                             {"num_scans", knot.num_scans}});
   }
   j["num_scans"] = landmark.num_scans;

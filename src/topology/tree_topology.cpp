@@ -22,6 +22,11 @@ constexpr double kTrunkRootCost = 1.0;
 constexpr double kOtherRootCost = 20.0;
 // How far round a base wood is looked at to decide what is low.
 constexpr double kNeighbourhoodM = 5.0;
+// A fork: arms that bend off by this much, open this far, and are about as thick as each other.
+constexpr double kStraightOnDeg = 14.0;
+constexpr double kMaxForkBendDeg = 60.0;
+constexpr double kForkOpeningDeg = 25.0;
+constexpr double kForkRadiusRatio = 1.6;
 
 // -------------------------------------------------------------------------------------------
 // Geometry
@@ -264,6 +269,46 @@ void FinishChain(const std::vector<Piece>& pieces, Chain* chain) {
   }
 }
 
+// True when a branch ends here in a fork: two or more arms of similar thickness begin close to this
+// end, lead away from each other, and none of them goes straight on. Then the arms are branches of
+// their own; if one goes on straight, it is the same branch and the others leave it.
+bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const TopologyConfig& config) {
+  const Piece& stem = pieces[piece];
+  const Vector3d direction = stem.Outward(end);
+  struct Arm {
+    Vector3d away;
+    double bend, radius;
+  };
+  std::vector<Arm> arms;
+  const double reach = 0.6 * config.attach_reach_m + stem.radius[end];
+  for (int k = 0; k < static_cast<int>(pieces.size()); ++k) {
+    if (k == piece) continue;
+    for (int f = 0; f < 2; ++f) {
+      const Vector3d away = -pieces[k].Outward(f);
+      const double bend = std::acos(std::clamp(direction.dot(away), -1.0, 1.0));
+      if (bend > kMaxForkBendDeg * kDeg) continue;
+      const Vector3d offset = pieces[k].end[f] - stem.end[end];
+      if (offset.norm() > reach || offset.dot(direction) < -stem.radius[end]) continue;
+      // Its axis, run backwards, comes from this end.
+      const double miss = (offset - offset.dot(away) * away).norm();
+      if (miss > stem.radius[end] + config.attach_offset_m) continue;
+      arms.push_back({away, bend, pieces[k].radius[f]});
+    }
+  }
+  for (const Arm& a : arms) {
+    if (a.bend < kStraightOnDeg * kDeg) return false;
+  }
+  for (std::size_t i = 0; i < arms.size(); ++i) {
+    for (std::size_t k = i + 1; k < arms.size(); ++k) {
+      const double ratio = std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
+      if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) && ratio < kForkRadiusRatio) {
+        return true;
+      }
+    }
+  }
+  return false;
+}
+
 // Joins pieces end to end, cheapest joints first; each end once and never into a ring.
 std::vector<Chain> MakeChains(const std::vector<Piece>& pieces, const TopologyConfig& config) {
   const int n = static_cast<int>(pieces.size());
@@ -274,7 +319,14 @@ std::vector<Chain> MakeChains(const std::vector<Piece>& pieces, const TopologyCo
     while (group[i] != i) i = group[i] = group[group[i]];
     return i;
   };
+  std::map<std::pair<int, int>, bool> fork;
+  const auto is_fork = [&](int piece, int end) {
+    const auto [it, is_new] = fork.emplace(std::make_pair(piece, end), false);
+    if (is_new) it->second = IsFork(pieces, piece, end, config);
+    return it->second;
+  };
   for (const Joint& joint : FindJoints(pieces, config)) {
+    if (is_fork(joint.piece_a, joint.end_a) || is_fork(joint.piece_b, joint.end_b)) continue;
     auto& a = next[joint.piece_a][joint.end_a];
     auto& b = next[joint.piece_b][joint.end_b];
     if (a.first >= 0 || b.first >= 0) continue;
