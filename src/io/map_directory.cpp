@@ -121,6 +121,14 @@ Json VecJson(const Eigen::Vector3d& v, const char* what, int id) {
   return {Finite(v.x(), what, id), Finite(v.y(), what, id), Finite(v.z(), what, id)};
 }
 
+std::vector<double> UpperTriangle(const Matrix5d& covariance, const char* what, int id) {
+  std::vector<double> values;
+  for (int r = 0; r < 5; ++r) {
+    for (int c = r; c < 5; ++c) values.push_back(Finite(covariance(r, c), what, id));
+  }
+  return values;
+}
+
 Json LandmarkJson(const Landmark& landmark) {
   const auto finite = [&](double v, const char* what) { return Finite(v, what, landmark.id); };
   Json j;
@@ -129,13 +137,8 @@ Json LandmarkJson(const Landmark& landmark) {
   j["axis"] = VecJson(landmark.cylinder.axis, "the axis of landmark", landmark.id);
   j["point"] = VecJson(landmark.cylinder.point, "the point of landmark", landmark.id);
   j["curvature"] = finite(landmark.cylinder.curvature, "the curvature of landmark");
-  Json covariance = Json::array();
-  for (int r = 0; r < 5; ++r) {
-    for (int c = r; c < 5; ++c) {
-      covariance.push_back(finite(landmark.covariance(r, c), "the covariance of landmark"));
-    }
-  }
-  j["covariance_upper"] = std::move(covariance);
+  j["covariance_upper"] =
+      UpperTriangle(landmark.covariance, "the covariance of landmark", landmark.id);
   j["s_min_m"] = finite(landmark.s_min_m, "s_min_m of landmark");
   j["s_max_m"] = finite(landmark.s_max_m, "s_max_m of landmark");
   j["s_min_sigma_m"] = finite(landmark.s_min_sigma_m, "s_min_sigma_m of landmark");
@@ -153,6 +156,60 @@ Json LandmarkJson(const Landmark& landmark) {
   j["mean_abs_deviation_m"] =
       finite(landmark.mean_abs_deviation_m, "mean_abs_deviation_m of landmark");
   return j;
+}
+
+// What the mapper keeps of a landmark beside what the map shows of it.
+Json LandmarkStateJson(const LandmarkState& state) {
+  const char* what = "the state of landmark";
+  const auto finite = [&](double v) { return Finite(v, what, state.id); };
+  Json j;
+  j["id"] = state.id;
+  j["confirmed"] = state.confirmed;
+  j["axis"] = VecJson(state.line.axis, what, state.id);
+  j["point"] = VecJson(state.line.point, what, state.id);
+  j["curvature"] = finite(state.line.curvature);
+  j["covariance_upper"] = UpperTriangle(state.covariance, what, state.id);
+  j["knots"] = Json::array();
+  for (const RadiusProfile::Knot& knot : state.profile.knots()) {
+    Json bins = Json::array();
+    for (const RadiusProfile::Bin& bin : knot.bins) {
+      bins.push_back({bin.index, finite(bin.weight), finite(bin.weighted_radius), bin.num_scans});
+    }
+    j["knots"].push_back(
+        {{"index", knot.index}, {"num_scans", knot.num_scans}, {"bins", std::move(bins)}});
+  }
+  j["first_cell"] = state.first_cell;
+  j["coverage"] = state.coverage;
+  j["end_sigma_m"] = finite(state.end_sigma_m);
+  j["num_scans"] = state.num_scans;
+  j["num_points"] = state.num_points;
+  j["arc_seen"] = state.arc_seen.to_string();
+  j["deviation_sum_m"] = finite(state.deviation_sum_m);
+  j["first_scan"] = state.first_scan;
+  j["last_scan"] = state.last_scan;
+  return j;
+}
+
+// One key of the file's object on a line, one entry of a list of objects on a line: readable, and a
+// change of one landmark is a change of one line.
+std::string Pretty(const Json& json) {
+  std::string out = "{";
+  const char* separator = "\n";
+  for (const auto& item : json.items()) {
+    out += separator + Json(item.key()).dump() + ": ";
+    separator = ",\n";
+    if (item.value().is_array() && !item.value().empty() && item.value().front().is_object()) {
+      const char* entry_separator = "[\n ";
+      for (const Json& entry : item.value()) {
+        out += entry_separator + entry.dump();
+        entry_separator = ",\n ";
+      }
+      out += "]";
+    } else {
+      out += item.value().dump();
+    }
+  }
+  return out + "\n}\n";
 }
 
 Json CylinderJson(const MapCylinder& c) {
@@ -341,22 +398,84 @@ class Reader {
   std::string path_;
 };
 
+Matrix5d ReadUpperTriangle(const Reader& j) {
+  j.RequireSize(15);
+  Matrix5d matrix;
+  std::size_t k = 0;
+  for (int r = 0; r < 5; ++r) {
+    for (int c = r; c < 5; ++c, ++k) matrix(r, c) = matrix(c, r) = j.At(k).Double();
+  }
+  return matrix;
+}
+
+Cylinder ReadLine(const Reader& j) {
+  Cylinder cylinder;
+  cylinder.axis = j["axis"].UnitVector();
+  cylinder.point = j["point"].Vector();
+  cylinder.curvature = j["curvature"].Double();
+  if (!(cylinder.curvature > 0.0)) j["curvature"].Fail("is not positive");
+  return cylinder;
+}
+
+std::bitset<Landmark::kArcBins> ReadArc(const Reader& j) {
+  const std::string arc = j.String();
+  if (arc.size() != Landmark::kArcBins || arc.find_first_not_of("01") != std::string::npos) {
+    j.Fail(fmt::format("must be {} digits 0 or 1", Landmark::kArcBins));
+  }
+  return std::bitset<Landmark::kArcBins>(arc);
+}
+
+LandmarkState ReadLandmarkState(const Reader& j) {
+  LandmarkState state;
+  state.id = j["id"].NonNegative();
+  state.confirmed = j["confirmed"].Bool();
+  state.line = ReadLine(j);
+  state.covariance = ReadUpperTriangle(j["covariance_upper"]);
+  std::vector<RadiusProfile::Knot> knots;
+  const Reader list = j["knots"];
+  const std::size_t num_knots = list.ArraySize();
+  for (std::size_t i = 0; i < num_knots; ++i) {
+    const Reader entry = list.At(i);
+    RadiusProfile::Knot knot;
+    knot.index = entry["index"].Int();
+    knot.num_scans = entry["num_scans"].NonNegative();
+    const Reader bins = entry["bins"];
+    const std::size_t num_bins = bins.ArraySize();
+    for (std::size_t k = 0; k < num_bins; ++k) {
+      const Reader values = bins.At(k);
+      values.RequireSize(4);
+      RadiusProfile::Bin bin{values.At(0).NonNegative(), values.At(1).Double(), values.At(2).Double(),
+                             values.At(3).NonNegative()};
+      if (!(bin.weight > 0.0)) values.At(1).Fail("is not positive");
+      if (!knot.bins.empty() && bin.index <= knot.bins.back().index) {
+        values.At(0).Fail("is not in ascending order");
+      }
+      knot.bins.push_back(bin);
+    }
+    if (!knots.empty() && knot.index <= knots.back().index) {
+      entry["index"].Fail("is not in ascending order");
+    }
+    knots.push_back(std::move(knot));
+  }
+  state.profile.set_knots(std::move(knots));
+  state.first_cell = j["first_cell"].Int();
+  state.coverage = j["coverage"].Ints();
+  state.end_sigma_m = j["end_sigma_m"].Double();
+  state.num_scans = j["num_scans"].NonNegative();
+  state.num_points = j["num_points"].NonNegative();
+  state.arc_seen = ReadArc(j["arc_seen"]);
+  state.deviation_sum_m = j["deviation_sum_m"].Double();
+  state.first_scan = j["first_scan"].Int64();
+  state.last_scan = j["last_scan"].Int64();
+  return state;
+}
+
 Landmark ReadLandmark(const Reader& j) {
   Landmark landmark;
   landmark.id = j["id"].NonNegative();
   landmark.confirmed = j["confirmed"].Bool();
-  landmark.cylinder.axis = j["axis"].UnitVector();
-  landmark.cylinder.point = j["point"].Vector();
-  landmark.cylinder.curvature = j["curvature"].Double();
-  if (!(landmark.cylinder.curvature > 0.0)) j["curvature"].Fail("is not positive");
-  const Reader covariance = j["covariance_upper"];
-  covariance.RequireSize(15);
-  std::size_t k = 0;
-  for (int r = 0; r < 5; ++r) {
-    for (int c = r; c < 5; ++c, ++k) {
-      landmark.covariance(r, c) = landmark.covariance(c, r) = covariance.At(k).Double();
-    }
-  }
+  landmark.cylinder = ReadLine(j);
+  landmark.covariance = ReadUpperTriangle(j["covariance_upper"]);
   landmark.s_min_m = j["s_min_m"].Double();
   landmark.s_max_m = j["s_max_m"].Double();
   if (landmark.s_max_m < landmark.s_min_m) j["s_max_m"].Fail("is below s_min_m");
@@ -377,11 +496,7 @@ Landmark ReadLandmark(const Reader& j) {
   }
   landmark.num_scans = j["num_scans"].NonNegative();
   landmark.num_points = j["num_points"].NonNegative();
-  const std::string arc = j["arc_seen"].String();
-  if (arc.size() != Landmark::kArcBins || arc.find_first_not_of("01") != std::string::npos) {
-    j["arc_seen"].Fail(fmt::format("must be {} digits 0 or 1", Landmark::kArcBins));
-  }
-  landmark.arc_seen = std::bitset<Landmark::kArcBins>(arc);
+  landmark.arc_seen = ReadArc(j["arc_seen"]);
   landmark.mean_abs_deviation_m = j["mean_abs_deviation_m"].Double();
   return landmark;
 }
@@ -702,7 +817,13 @@ std::string TreeMapJson(const MapFiles& files) {
   j["landmarks"] = Json::array();
   for (const Landmark& landmark : files.landmarks) j["landmarks"].push_back(LandmarkJson(landmark));
   j["topology"] = TopologyJson(files.topology);
-  return j.dump(1) + "\n";
+  j["upright"] = files.snapshot.upright;
+  j["next_landmark_state_id"] = files.snapshot.next_landmark_id;
+  j["landmark_states"] = Json::array();
+  for (const LandmarkState& state : files.snapshot.landmarks) {
+    j["landmark_states"].push_back(LandmarkStateJson(state));
+  }
+  return Pretty(j);
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -791,6 +912,9 @@ MapFiles LoadMap(const std::string& directory) {
     j["next_landmark_id"].Fail("is not above every landmark's id");
   }
   files.topology = ReadTopology(j["topology"]);
+  files.snapshot.upright = j["upright"].Bool();
+  files.snapshot.next_landmark_id = j["next_landmark_state_id"].NonNegative();
+  read_list("landmark_states", ReadLandmarkState, &files.snapshot.landmarks);
 
   const std::filesystem::path trajectory = root / "trajectory.tum";
   if (std::filesystem::exists(trajectory)) files.trajectory = ReadTrajectory(trajectory.string());

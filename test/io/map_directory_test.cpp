@@ -71,6 +71,23 @@ MapFiles SomeMap() {
   TreeTopology topology{TopologyConfig()};
   files.model = topology.Build(files.landmarks, 1234567890123456789);
   files.topology = topology.state();
+  files.snapshot.upright = true;
+  files.snapshot.next_landmark_id = 12;
+  LandmarkState state;
+  state.id = 4;
+  state.line = files.landmarks[1].cylinder;
+  state.covariance = files.landmarks[1].covariance;
+  state.profile.set_knots({{-2, {{3, 1.0 / 7e-6, 0.05 / 7e-6, 5}, {8, 40000.0, 2001.0, 2}}, 7}, {1, {}, 0}});
+  state.first_cell = -9;
+  state.coverage = {3, 5, 0, 7};
+  state.num_scans = 7;
+  state.num_points = 99;
+  state.arc_seen.set(35);
+  state.deviation_sum_m = 0.1;
+  state.first_scan = 3;
+  state.last_scan = 123456789012;
+  state.confirmed = true;
+  files.snapshot.landmarks = {state};
   for (int i = 0; i < 5; ++i) {
     StampedPose pose;
     pose.stamp_ns = 1700000000123456789 + i * 100000000LL;
@@ -116,6 +133,18 @@ TEST_F(Directory, WhatIsSavedIsLoaded) {
   EXPECT_EQ(loaded.model.stamp_ns, saved.model.stamp_ns);
   EXPECT_EQ(loaded.config, saved.config);
   EXPECT_EQ(loaded.frame, "map");
+  EXPECT_TRUE(loaded.snapshot.upright);
+  EXPECT_EQ(loaded.snapshot.next_landmark_id, 12);
+  ASSERT_EQ(loaded.snapshot.landmarks.size(), 1u);
+  const LandmarkState &was = saved.snapshot.landmarks[0], &is = loaded.snapshot.landmarks[0];
+  EXPECT_EQ(is.line.point, was.line.point);
+  EXPECT_EQ(is.covariance, was.covariance);
+  EXPECT_EQ(is.coverage, was.coverage);
+  EXPECT_EQ(is.first_cell, -9);
+  EXPECT_EQ(is.last_scan, was.last_scan);
+  ASSERT_EQ(is.profile.knots().size(), 2u);
+  EXPECT_EQ(is.profile.knots()[0].bins[0].weighted_radius, 0.05 / 7e-6);
+  EXPECT_EQ(is.profile.knots()[0].bins[1].index, 8);
   ASSERT_EQ(loaded.trajectory.size(), 5u);
   for (std::size_t i = 0; i < 5; ++i) {
     EXPECT_EQ(loaded.trajectory[i].stamp_ns, saved.trajectory[i].stamp_ns);
@@ -266,14 +295,17 @@ TEST_F(Directory, BadFilesAreRefusedWithFileAndField) {
   expect("dendro_slam tree map", "some other map", "format");
   expect("\"frame\": \"map\"", "\"frame\": 3", "frame");
   expect("\"next_landmark_id\": 12", "\"next_landmark_id\": 3", "next_landmark_id");
-  expect("\"curvature\": ", "\"curvature\": -", "landmarks[0].curvature is not positive");
-  expect("\"curvature\": ", "\"curve\": ", "landmarks[0].curvature is missing");
-  expect("\"confirmed\": true", "\"confirmed\": 1", "landmarks[0].confirmed");
-  expect("\"arc_seen\": \"0", "\"arc_seen\": \"2", "landmarks[0].arc_seen");
-  expect("\"s_max_m\": ", "\"s_max_m\": -9, \"was\": ", "landmarks[0].s_max_m is below");
-  expect("\"status\": \"MEASURED\"", "\"status\": \"GUESSED\"", "status");
-  expect("\"next_branch_id\": ", "\"next_branch_id\": 0, \"was\": ", "topology.branch_of_landmark");
-  expect("\"id\": 4", "\"id\": 0", "is used twice");
+  expect("\"curvature\":", "\"curvature\":-", "landmarks[0].curvature is not positive");
+  expect("\"curvature\":", "\"curve\":", "landmarks[0].curvature is missing");
+  expect("\"confirmed\":true", "\"confirmed\":1", "landmarks[0].confirmed");
+  expect("\"arc_seen\":\"0", "\"arc_seen\":\"2", "landmarks[0].arc_seen");
+  expect("\"s_max_m\":", "\"s_max_m\":-9,\"was\":", "landmarks[0].s_max_m is below");
+  expect("\"status\":\"MEASURED\"", "\"status\":\"GUESSED\"", "status");
+  expect("\"next_branch_id\":", "\"next_branch_id\":0,\"was\":", "topology.branch_of_landmark");
+  expect("\"id\":4", "\"id\":0", "is used twice");
+  expect("\"knots\":[{\"index\":-2", "\"knots\":[{\"index\":9", "landmark_states[0].knots[1].index");
+  expect("\"coverage\":[3,", "\"coverage\":[3.5,", "landmark_states[0].coverage[0]");
+  expect("\"upright\": true", "\"upright\": 1", "upright");
   expect("\"stamp_ns\": ", "\"stamp_ns\": 1e400, \"was\": ", "JSON");
   // Cut off anywhere: refused, never a crash.
   for (std::size_t length = 0; length < good.size() - 2; length += good.size() / 97) {
