@@ -101,6 +101,8 @@ void MapperConfig::Validate() const {
   Require(observation_axis_floor_deg >= 0.0, "observation_axis_floor_deg must be >= 0");
   Require(observation_offset_floor_m >= 0.0, "observation_offset_floor_m must be >= 0");
   Require(robust_width > 0.0, "robust_width must be > 0");
+  Require(nearby_radius_m > 0.0, "nearby_radius_m must be > 0");
+  Require(nearby_max >= 1, "nearby_max must be >= 1");
   Require(min_radius_m > 0.0, "min_radius_m must be > 0");
   Require(max_radius_sigma_rel > 0.0, "max_radius_sigma_rel must be > 0");
   Require(relocalize_axis_deg > 0.0, "relocalize_axis_deg must be > 0");
@@ -158,6 +160,8 @@ class Mapper::Impl {
   // First pose: known exactly, unless it comes from finding a loaded map again.
   std::optional<Eigen::Isometry3d> start_pose;
 
+  std::map<int, Matrix5d> marginals;  // of the landmarks' lines, as last computed
+
   // Landmarks near the key frame, in its frame, with their covariance relative to it.
   std::vector<Landmark> nearby;
 
@@ -195,7 +199,7 @@ class Mapper::Impl {
                               const FittedCylinder& fit,
                               const Eigen::Isometry3d& T_map_lidar) const;
   void MaintainMap();
-  void MoveFactors(Key from, Key to, const std::vector<FactorId>& factors, const Cylinder* initial);
+  void MoveFactors(const std::vector<FactorId>& factors, Key to, const Cylinder* initial);
   void RefreshLines();
   void RefreshNearby(int id);
 };
@@ -440,16 +444,15 @@ void Mapper::Impl::MaintainMap() {
     const std::vector<FactorId> factors = solver.FactorsOf(LandmarkKey(id));
     solver.RemoveFactors(factors);
     map.Remove(id);
+    marginals.erase(id);
   }
   // A few per key frame: the rest waits for the next one.
   for (int i = 0; i < 3; ++i) {
     const std::optional<LandmarkMerge> merge = map.FindDuplicate(config.association);
     if (!merge) break;
-    MoveFactors(LandmarkKey(merge->drop_id),
-                LandmarkKey(merge->keep_id),
-                solver.FactorsOf(LandmarkKey(merge->drop_id)),
-                nullptr);
+    MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)), LandmarkKey(merge->keep_id), nullptr);
     map.Merge(*merge);
+    marginals.erase(merge->drop_id);
   }
   for (int i = 0; i < 3; ++i) {
     const std::optional<LandmarkSplit> split = map.FindSplit();
@@ -459,6 +462,7 @@ void Mapper::Impl::MaintainMap() {
     const double middle = 0.5 * (split->gap_begin_m + split->gap_end_m);
     const std::pair<int, bool> piece = map.Split(*split);
     map.SetLine(piece.first, line, covariance);
+    marginals[piece.first] = covariance;
     std::vector<FactorId> moved;
     for (FactorId factor : solver.FactorsOf(LandmarkKey(split->landmark_id))) {
       const auto* observation =
@@ -470,7 +474,14 @@ void Mapper::Impl::MaintainMap() {
       if ((s > middle) == piece.second) moved.push_back(factor);
     }
     if (!moved.empty()) {
-      MoveFactors(LandmarkKey(split->landmark_id), LandmarkKey(piece.first), moved, &line);
+      MoveFactors(moved, LandmarkKey(piece.first), &line);
+    } else {
+      // Nothing of this session fell on it: what an earlier one knew holds for both pieces.
+      Values values;
+      values.Insert(LandmarkKey(piece.first), Value(line));
+      solver.Update({std::make_shared<CylinderPrior>(
+                        LandmarkKey(piece.first), line, NoiseModel::Covariance(covariance))},
+                    values);
     }
     if (!solver.Contains(LandmarkKey(piece.first))) map.Remove(piece.first);
     if (!solver.Contains(LandmarkKey(split->landmark_id))) map.Remove(split->landmark_id);
@@ -478,11 +489,9 @@ void Mapper::Impl::MaintainMap() {
 }
 
 // Hangs observations of one landmark on another one, which `initial` creates.
-void Mapper::Impl::MoveFactors(Key from,
+void Mapper::Impl::MoveFactors(const std::vector<FactorId>& factors,
                                Key to,
-                               const std::vector<FactorId>& factors,
                                const Cylinder* initial) {
-  (void)from;
   FactorList moved;
   UpdateOptions options;
   for (FactorId id : factors) {
@@ -490,6 +499,8 @@ void Mapper::Impl::MoveFactors(Key from,
     if (const auto* o = dynamic_cast<const CylinderFactor*>(factor.get())) {
       moved.push_back(std::make_shared<CylinderFactor>(
           o->keys()[0], to, o->measured(), o->covariance(), o->parts(), o->noise().kernel()));
+    } else if (const auto* prior = dynamic_cast<const CylinderPrior*>(factor.get())) {
+      moved.push_back(std::make_shared<CylinderPrior>(to, prior->mean(), prior->noise()));
     }
     options.remove_factors.push_back(id);
   }
@@ -498,22 +509,40 @@ void Mapper::Impl::MoveFactors(Key from,
   solver.Update(moved, values, options);
 }
 
-// Brings the landmarks' lines and relative covariances up to date with the graph.
+// Brings the landmarks' lines up to date with the graph, and the covariances of those in reach of
+// the sensor: the others cannot be seen, theirs wait.
 void Mapper::Impl::RefreshLines() {
   const Key pose = PoseKey(num_key_frames - 1);
   T_map_kf = solver.Estimate<Eigen::Isometry3d>(pose);
-  nearby.clear();
+  std::vector<std::pair<double, int>> by_distance;
+  for (const LandmarkState& state : map.states()) {
+    const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(state.id));
+    map.SetLine(state.id, line, state.covariance);
+    // The nearest point of the part of the line that was seen.
+    const double cell = config.tree_map.coverage_cell_m;
+    const double begin = state.first_cell * cell;
+    const double end = begin + cell * static_cast<double>(state.coverage.size());
+    const double s = std::clamp(
+        (T_map_kf.translation() - line.point).dot(line.axis), begin, std::max(begin, end));
+    const double distance = (line.point + s * line.axis - T_map_kf.translation()).norm();
+    if (distance <= config.nearby_radius_m) by_distance.emplace_back(distance, state.id);
+  }
+  std::sort(by_distance.begin(), by_distance.end());
+  if (static_cast<int>(by_distance.size()) > config.nearby_max) {
+    by_distance.resize(static_cast<std::size_t>(config.nearby_max));
+  }
   std::vector<int> ids;
   std::vector<Key> keys{pose};
-  for (const LandmarkState& state : map.states()) {
-    ids.push_back(state.id);
-    keys.push_back(LandmarkKey(state.id));
-  }
+  for (const auto& [distance, id] : by_distance) ids.push_back(id);
+  std::sort(ids.begin(), ids.end());
+  for (int id : ids) keys.push_back(LandmarkKey(id));
   const Eigen::MatrixXd joint = solver.JointMarginalCovariance(keys);
   kf_covariance = joint.topLeftCorner<6, 6>();
+  nearby.clear();
   for (std::size_t i = 0; i < ids.size(); ++i) {
     const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(ids[i]));
     const Eigen::Index at = 6 + 5 * static_cast<Eigen::Index>(i);
+    marginals[ids[i]] = joint.block<5, 5>(at, at);
     // Covariance of the landmark as the key frame sees it: what both drifted together cancels.
     const Cylinder seen = TransformCylinder(T_map_kf.inverse(), line);
     Eigen::Matrix<double, 5, 6> J_pose;
@@ -733,6 +762,7 @@ void Mapper::Impl::StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3
     covariance(4, 4) += 1e-6;
     factors.push_back(std::make_shared<CylinderPrior>(
         LandmarkKey(state.id), state.line, NoiseModel::Covariance(covariance)));
+    marginals[state.id] = state.covariance;
     scan_number = std::max(scan_number, state.last_scan);
   }
   if (!factors.empty()) solver.Update(factors, values);
@@ -794,10 +824,8 @@ std::vector<StampedPose> Mapper::Impl::Trajectory() const {
 std::vector<LandmarkState> Mapper::Impl::StatesWithMarginals() const {
   std::vector<LandmarkState> states = map.states();
   for (LandmarkState& state : states) {
-    const Key key = LandmarkKey(state.id);
-    if (!solver.Contains(key)) continue;
-    state.line = solver.Estimate<Cylinder>(key);
-    state.covariance = solver.MarginalCovariance(key);
+    const auto it = marginals.find(state.id);
+    if (it != marginals.end()) state.covariance = it->second;
   }
   return states;
 }

@@ -41,6 +41,8 @@ struct MapperConfig {
   double observation_offset_floor_m = 0.004;  ///< Added to the line's sigma [m]. >= 0.
   double robust_width = 2.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
                                         ///< weight (Huber). > 0.
+  double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
+  int nearby_max = 48;                  ///< Nor more than the nearest ones. >= 1.
   double min_radius_m = 0.008;          ///< Thinner fits are not mapped [m]. > 0.
   double max_radius_sigma_rel = 0.5;    ///< Fits that know their radius worse are not mapped. > 0.
 
@@ -82,6 +84,8 @@ struct MapperConfig {
     v("observation_axis_floor_deg", observation_axis_floor_deg);
     v("observation_offset_floor_m", observation_offset_floor_m);
     v("robust_width", robust_width);
+    v("nearby_radius_m", nearby_radius_m);
+    v("nearby_max", nearby_max);
     v("min_radius_m", min_radius_m);
     v("max_radius_sigma_rel", max_radius_sigma_rel);
     v("relocalize_axis_deg", relocalize_axis_deg);

@@ -1,0 +1,278 @@
+#include "dendro_slam/mapping/mapper.h"
+
+#include <cmath>
+#include <limits>
+
+#include <gtest/gtest.h>
+
+#include "synthetic_tree.h"
+
+namespace dendro {
+namespace {
+
+using namespace dendro_test;
+
+Eigen::Isometry3d TruthFromMap(const FlightResult& flight, const Mapper& mapper) {
+  return flight.truth.front() * mapper.Trajectory().front().T_map_lidar.inverse();
+}
+
+void ExpectGoodMap(const Mapper& mapper,
+                   const FlightResult& flight,
+                   const World& world,
+                   double ate_limit) {
+  const double ate = TrajectoryAte(flight, mapper);
+  const MapScore score =
+      Score(mapper.Landmarks(), world.branches(), TruthFromMap(flight, mapper));
+  int within1 = 0;
+  for (double sigmas : score.radius_error_sigmas) within1 += sigmas < 1.0 ? 1 : 0;
+  std::printf(
+      "ATE %.3f m (odometry %.3f), %d key frames, %zu landmarks on %d branches, %d false, radius "
+      "median %.2f %%, within one sigma %.0f %%, axis median %.2f deg\n",
+      ate,
+      flight.odometry_ate,
+      mapper.num_key_frames(),
+      mapper.Landmarks().size(),
+      score.branches_found,
+      score.false_count,
+      100.0 * Median(score.radius_error_rel),
+      100.0 * within1 / std::max<std::size_t>(1, score.radius_error_sigmas.size()),
+      Median(score.axis_error_rad) * 180.0 / M_PI);
+  EXPECT_LT(ate, ate_limit);
+  EXPECT_EQ(score.branches_found, static_cast<int>(world.branches().size()));
+  EXPECT_EQ(score.false_count, 0);
+  EXPECT_LE(mapper.Landmarks().size(), world.branches().size() + 2);
+  EXPECT_LT(Median(score.radius_error_rel), 0.01);
+  EXPECT_LT(Median(score.axis_error_rad), M_PI / 180.0);
+}
+
+TEST(Mapper, MapsATreeBetterThanTheOdometryFlies) {
+  World world(ThesisLikeTree(), 1);
+  Mapper mapper;
+  const FlightResult flight = Fly(&mapper, &world, {});
+  ExpectGoodMap(mapper, flight, world, 0.03);
+  EXPECT_LT(TrajectoryAte(flight, mapper), 0.5 * flight.odometry_ate);
+  // The map frame is the odometry's at the start.
+  EXPECT_LT(mapper.Trajectory().front().T_map_lidar.translation().norm(), 1e-3);
+  for (const MapperResult& result : flight.results) {
+    EXPECT_LE(result.error_after, result.error_before * (1.0 + 1e-9) + 1e-9);
+  }
+}
+
+TEST(Mapper, ARelocalisationJumpDoesNotBendTheMap) {
+  World world(ThesisLikeTree(), 2);
+  Mapper mapper;
+  FlightOptions options;
+  options.jump_at = 400;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  ExpectGoodMap(mapper, flight, world, 0.03);
+  int rejected = 0;
+  for (const MapperResult& result : flight.results) rejected += result.odometry_rejected ? 1 : 0;
+  EXPECT_GE(rejected, 1);
+  EXPECT_LE(rejected, 5);
+  // The transform to the odometry frame takes the jump.
+  EXPECT_GT(mapper.T_map_odom().translation().norm(), 0.3);
+}
+
+TEST(Mapper, AJumpWithoutIcpIsFoundByTheMap) {
+  World world(ThesisLikeTree(), 3);
+  Mapper mapper;
+  FlightOptions options;
+  options.jump_at = 400;
+  options.icp = false;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  ExpectGoodMap(mapper, flight, world, 0.03);
+}
+
+TEST(Mapper, WithoutIcp) {
+  World world(ThesisLikeTree(), 4);
+  Mapper mapper;
+  FlightOptions options;
+  options.icp = false;
+  ExpectGoodMap(mapper, Fly(&mapper, &world, options), world, 0.03);
+}
+
+TEST(Mapper, WithoutVio) {
+  World world(ThesisLikeTree(), 5);
+  Mapper mapper;
+  FlightOptions options;
+  options.vio = false;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  ExpectGoodMap(mapper, flight, world, 0.05);
+  EXPECT_LT(mapper.T_map_odom().translation().norm(), 1e-9);
+}
+
+TEST(Mapper, VioLostForFiveSeconds) {
+  World world(ThesisLikeTree(), 6);
+  Mapper mapper;
+  FlightOptions options;
+  options.vio_lost_from = 300;
+  options.vio_lost_to = 350;
+  ExpectGoodMap(mapper, Fly(&mapper, &world, options), world, 0.03);
+}
+
+TEST(Mapper, ATrunkDoesNotLoseItsTaper) {
+  World world({ThesisLikeTree()[0], ThesisLikeTree()[1]}, 7);
+  Mapper mapper;
+  FlightOptions options;
+  options.z0 = 0.8;
+  options.climb = 0.05;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  const MapScore score = Score(mapper.Landmarks(), world.branches(), TruthFromMap(flight, mapper));
+  EXPECT_EQ(score.branches_found, 2);
+  ASSERT_GT(score.radius_error_rel.size(), 8u);
+  // At every height, not only on average: the trunk goes from 20 to 12 cm.
+  for (double error : score.radius_error_rel) EXPECT_LT(error, 0.04);
+}
+
+TEST(Mapper, CollinearBranchesWithAGapStayTwo) {
+  std::vector<TrueBranch> branches = ThesisLikeTree();
+  const Eigen::Vector3d a(0.9, 0.15, 2.55), d = Eigen::Vector3d(1.8, 0.3, 1.1).normalized();
+  branches[1] = {{0, 0, 2.0}, {0.9, 0.15, 2.55}, 0.06, 0.06};
+  branches.push_back({a + 0.5 * d, a + 1.5 * d, 0.06, 0.06});
+  World world(branches, 8);
+  Mapper mapper;
+  const FlightResult flight = Fly(&mapper, &world, {});
+  const MapScore score = Score(mapper.Landmarks(), branches, TruthFromMap(flight, mapper));
+  EXPECT_EQ(score.branches_found, 5);
+  EXPECT_EQ(score.false_count, 0);
+}
+
+TEST(Mapper, AlongALoneTrunkTheDriftIsBoundedByTheOdometry) {
+  World world({{{0, 0, -1}, {0, 0, 12}, 0.2, 0.18}}, 9);
+  Mapper mapper;
+  FlightOptions options;
+  options.icp = false;
+  options.climb = 0.08;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  // Neither the motion along the trunk nor that around it is observable: both stay with the
+  // odometry, and the pose covariance says so.
+  EXPECT_LT(TrajectoryAte(flight, mapper), 1.3 * flight.odometry_ate + 0.02);
+  const Matrix6d P = flight.results.back().pose_covariance;
+  const Eigen::Matrix3d R = flight.results.back().T_map_lidar.linear();
+  const double sigma_z = std::sqrt((R * P.bottomRightCorner<3, 3>() * R.transpose())(2, 2));
+  EXPECT_GT(sigma_z, 0.03);
+  EXPECT_LT(sigma_z, 0.5);
+  EXPECT_LE(mapper.Landmarks().size(), 2u);
+}
+
+TEST(Mapper, FalseDetectionsDoNotEnterTheMap) {
+  World world(ThesisLikeTree(), 10);
+  Mapper mapper;
+  DriftingOdometry odometry(&world);
+  for (int i = 0; i < 300; ++i) {
+    const Eigen::Isometry3d T = CirclePose(0.1 * i, 4.0, 1.0, 1.2, 0.0);
+    MapperInput input;
+    input.stamp_ns = 100000000LL * (i + 1);
+    input.cylinders = world.Scan(T);
+    // A clump of leaves that looks like a cylinder, elsewhere every time.
+    const Eigen::Vector3d p(2.0 * world.Normal(), 2.0 * world.Normal(), 2.0 + world.Normal());
+    const TrueBranch ghost{p, p + Eigen::Vector3d(world.Normal(), world.Normal(), world.Normal()), 0.05, 0.05};
+    if (auto fit = world.Observe(ghost, T, 7)) input.cylinders.push_back(*fit);
+    input.T_odom_lidar = odometry.Next(T);
+    mapper.AddScan(input);
+  }
+  EXPECT_LE(mapper.Landmarks().size(), 5u);
+}
+
+TEST(Mapper, ASecondSessionFindsItselfAndKeepsTheIds) {
+  World world(ThesisLikeTree(), 11);
+  Mapper first;
+  const FlightResult flight1 = Fly(&first, &world, {});
+  const std::vector<Landmark> before = first.Landmarks();
+  const MapScore score1 = Score(before, world.branches(), TruthFromMap(flight1, first));
+  const MapSnapshot snapshot = first.Snapshot();
+
+  Mapper second;
+  second.Load(snapshot);
+  EXPECT_TRUE(second.relocalizing());
+  FlightOptions options;
+  options.start_time = 8.4;  // 120 degrees farther on, 3 m higher up in its own odometry frame
+  options.z0 = 1.5;
+  const FlightResult flight2 = Fly(&second, &world, options);
+  ASSERT_FALSE(second.relocalizing());
+  const std::vector<Landmark> after = second.Landmarks();
+  EXPECT_EQ(after.size(), before.size());
+  for (const Landmark& l : before) {
+    bool kept = false;
+    for (const Landmark& m : after) kept = kept || (m.id == l.id && m.num_scans > l.num_scans);
+    EXPECT_TRUE(kept) << "landmark " << l.id;
+  }
+  const MapScore score2 = Score(after, world.branches(), TruthFromMap(flight1, first));
+  EXPECT_EQ(score2.branches_found, 4);
+  EXPECT_EQ(score2.false_count, 0);
+  std::printf("radius median %.2f %% after one session, %.2f %% after two\n",
+              100 * Median(score1.radius_error_rel),
+              100 * Median(score2.radius_error_rel));
+  EXPECT_LE(Median(score2.radius_error_rel), Median(score1.radius_error_rel) * 1.2 + 0.001);
+  // The pose is in the loaded map's frame.
+  const Eigen::Isometry3d T_truth_map = TruthFromMap(flight1, first);
+  EXPECT_LT(((T_truth_map * flight2.results.back().T_map_lidar).translation() -
+             flight2.truth.back().translation())
+                .norm(),
+            0.1);
+}
+
+TEST(Mapper, SameInputSameBytes) {
+  std::vector<Landmark> maps[2];
+  for (auto& map : maps) {
+    World world(ThesisLikeTree(), 12);
+    Mapper mapper;
+    FlightOptions options;
+    options.scans = 150;
+    Fly(&mapper, &world, options);
+    map = mapper.Landmarks();
+  }
+  ASSERT_EQ(maps[0].size(), maps[1].size());
+  for (std::size_t i = 0; i < maps[0].size(); ++i) {
+    EXPECT_EQ(maps[0][i].cylinder.point, maps[1][i].cylinder.point);
+    EXPECT_EQ(maps[0][i].covariance, maps[1][i].covariance);
+    EXPECT_EQ(maps[0][i].RadiusAt(0.0), maps[1][i].RadiusAt(0.0));
+  }
+}
+
+TEST(Mapper, BadInputIsRefusedAndTheMapGoesOn) {
+  World world(ThesisLikeTree(), 13);
+  Mapper mapper;
+  FlightOptions options;
+  options.scans = 30;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  MapperInput late;
+  late.stamp_ns = flight.results.back().stamp_ns;
+  EXPECT_FALSE(mapper.AddScan(late).warning.empty());
+  MapperInput bad;
+  bad.stamp_ns = flight.results.back().stamp_ns + 100000000;
+  bad.cylinders = world.Scan(flight.truth.back());
+  bad.cylinders[0].cylinder.point.x() = std::numeric_limits<double>::quiet_NaN();
+  if (bad.cylinders.size() > 1) bad.cylinders[1].covariance.setZero();
+  bad.T_odom_lidar = Eigen::Isometry3d::Identity();
+  bad.T_odom_lidar->translation().x() = std::numeric_limits<double>::infinity();
+  EXPECT_TRUE(mapper.AddScan(bad).T_map_lidar.matrix().allFinite());
+  MapperInput empty;
+  empty.stamp_ns = bad.stamp_ns + 100000000;
+  EXPECT_TRUE(mapper.AddScan(empty).T_map_lidar.matrix().allFinite());
+  mapper.Reset();
+  EXPECT_TRUE(mapper.Landmarks().empty());
+  EXPECT_TRUE(mapper.AddScan(empty).is_key_frame);
+}
+
+TEST(Mapper, BadSnapshotsAreRefusedAndTheMapStays) {
+  World world(ThesisLikeTree(), 14);
+  Mapper mapper;
+  FlightOptions options;
+  options.scans = 60;
+  Fly(&mapper, &world, options);
+  MapSnapshot snapshot = mapper.Snapshot();
+  ASSERT_FALSE(snapshot.landmarks.empty());
+  const std::size_t count = mapper.AllLandmarks().size();
+  MapSnapshot bad = snapshot;
+  bad.landmarks[0].line.point.x() = std::numeric_limits<double>::quiet_NaN();
+  EXPECT_THROW(mapper.Load(bad), std::invalid_argument);
+  bad = snapshot;
+  bad.next_landmark_id = 0;
+  EXPECT_THROW(mapper.Load(bad), std::invalid_argument);
+  EXPECT_EQ(mapper.AllLandmarks().size(), count);
+  EXPECT_FALSE(mapper.relocalizing());
+}
+
+}  // namespace
+}  // namespace dendro
