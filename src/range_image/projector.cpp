@@ -19,6 +19,7 @@ constexpr int kBins = 72000;
 constexpr int kSpeedSlots = 128;
 // Azimuths on a column's border must not scatter over both columns by the rounding of floats.
 constexpr double kBorderColumns = 0.002;
+constexpr double kLagColumns = 0.3;   // How far a firing may lie beyond its column.
 constexpr double kLongestStepS = 0.012;  // A quarter of a revolution at 1200 rpm.
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
@@ -290,32 +291,16 @@ void Projector::GroupColumns() {
 
 void Projector::PlaceFirings() {
   const double per_deg = config_.cols / 360.0;
-  for (Firing& firing : firings_) {
-    firing.col = static_cast<std::int32_t>(
-        std::floor(firing.azimuth_deg * per_deg + kBorderColumns));
-  }
-  // Two firings in one column beside an empty one: the one nearer to the border moves over.
-  const int n = static_cast<int>(firings_.size());
-  const auto col_at = [&](int i) {
-    if (i < 0) return firings_[static_cast<std::size_t>(i + n)].col - config_.cols;
-    if (i >= n) return firings_[static_cast<std::size_t>(i - n)].col + config_.cols;
-    return firings_[static_cast<std::size_t>(i)].col;
-  };
-  for (int i = 1; i < n; ++i) {
-    Firing& a = firings_[static_cast<std::size_t>(i) - 1];
-    Firing& b = firings_[static_cast<std::size_t>(i)];
-    if (a.col != b.col) continue;
-    constexpr double kFar = 1.0;
-    double left = kFar;
-    double right = kFar;
-    if (col_at(i - 2) < a.col - 1) left = a.azimuth_deg * per_deg - a.col;
-    if (col_at(i + 1) > b.col + 1) right = b.col + 1 - b.azimuth_deg * per_deg;
-    if (std::min(left, right) > 0.25) continue;
-    if (left < right) {
-      --a.col;
-    } else {
-      ++b.col;
-    }
+  for (std::size_t i = 0; i < firings_.size(); ++i) {
+    Firing& firing = firings_[i];
+    const double x = firing.azimuth_deg * per_deg;
+    firing.col = static_cast<std::int32_t>(std::floor(x + kBorderColumns));
+    if (i == 0) continue;
+    // Where noise steps over a column, the firing takes it although it lies a little beyond; the
+    // next column with two firings makes up for it.
+    const Firing& before = firings_[i - 1];
+    const bool consecutive = firing.azimuth_deg - before.azimuth_deg < 1.5 * pitch_deg_;
+    if (consecutive && firing.col == before.col + 2 && x - firing.col < kLagColumns) --firing.col;
   }
 }
 

@@ -96,6 +96,7 @@ TEST(Projector, EveryReturnFindsItsPixel) {
   EXPECT_EQ(image.cols, 1800);
   EXPECT_FALSE(image.deskewed);
   ASSERT_EQ(image.pixel_of_point.size(), scan.points.size());
+  int beyond = 0;
   for (std::size_t i = 0; i < scan.points.size(); ++i) {
     ASSERT_GE(image.pixel_of_point[i], 0);
     const std::size_t pixel = static_cast<std::size_t>(image.pixel_of_point[i]);
@@ -106,7 +107,8 @@ TEST(Projector, EveryReturnFindsItsPixel) {
         3600.0 * vlp16::RingTimeS(scan.points[i].ring);
     double off = azimuth * 5.0 - (static_cast<double>(pixel % 1800) + 0.5);
     off -= 1800.0 * std::round(off / 1800.0);
-    EXPECT_LT(std::abs(off), 0.52);
+    EXPECT_LT(std::abs(off), 0.82);
+    beyond += std::abs(off) > 0.52 ? 1 : 0;
     if (image.point_index[pixel] == static_cast<int>(i)) {
       EXPECT_EQ(image.intensity[pixel], scan.points[i].intensity);
       EXPECT_FLOAT_EQ(image.time_s[pixel], scan.points[i].time_s);
@@ -116,10 +118,12 @@ TEST(Projector, EveryReturnFindsItsPixel) {
     }
   }
   EXPECT_EQ(Returns(image), 16 * 1800) << "a wall all around leaves no pixel empty";
-  // 1808 firings end 0.09 degrees before the revolution does: one column at the seam.
-  EXPECT_EQ(projector.report().filled_columns, 1);
+  // 1808 firings end 0.09 degrees before the revolution does, so at the seam a column is stepped
+  // over; the firings after it lie a little beyond their columns until the first shared one.
+  EXPECT_LT(beyond, 16 * 80);
+  EXPECT_EQ(projector.report().filled_columns, 0);
   EXPECT_EQ(projector.report().hidden_points,
-            static_cast<int>(scan.points.size()) - 16 * 1799);
+            static_cast<int>(scan.points.size()) - 16 * 1800);
   EXPECT_NEAR(projector.report().rpm, 600.0, 0.1);
   EXPECT_FALSE(projector.report().ring_derived);
   EXPECT_FALSE(projector.report().time_derived);

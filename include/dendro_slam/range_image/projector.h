@@ -65,9 +65,9 @@ struct ProjectionReport {
 /// 1. each return's azimuth is taken back to the start of its firing (the head's speed, seen in the
 ///    scan's times, times the laser's delay);
 /// 2. returns within half a firing pitch are one firing, whatever the order of the cloud;
-/// 3. a firing goes to the column of its mean azimuth. Where noise puts two firings in one column
-///    beside an empty one, the nearer of them moves over. About 8 columns per revolution hold two
-///    firings at 600 rpm; there the nearer return of each pixel wins;
+/// 3. a firing goes to the column of its mean azimuth, or to the one before where noise has stepped
+///    over that by less than 0.3 columns. About 8 columns per revolution hold two firings at
+///    600 rpm; there the nearer return of each pixel wins;
 /// 4. a column between two consecutive firings that none of them met (the sensor turns faster than
 ///    the columns) repeats the nearer neighbour, returns and misses alike: `filled_columns`;
 /// 5. a pixel without a return gets the beam its laser really fired: the azimuth of the column's
@@ -76,7 +76,7 @@ struct ProjectionReport {
 /// The uniform model (other sensors, or the thesis' 32 x 360) bins each return by its own azimuth
 /// and elevation; beams of missing pixels point at the pixel's centre.
 ///
-/// Stage 1's input. One instance per thread (it keeps its work space); about 2 ms per scan.
+/// Stage 1's input. One instance per thread (it keeps its work space); about 3 ms per scan.
 /// @note Deviates: the thesis projects to 32 x 360 (section 4.1), which a VLP-16 cannot fill.
 class Projector {
  public:
