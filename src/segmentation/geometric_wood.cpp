@@ -12,6 +12,7 @@ namespace dendro {
 namespace {
 
 constexpr double kPi = 3.14159265358979323846;
+constexpr float kRiseHeight = 0.5F;  // Mean height of what may still be a rise of the ground [m].
 constexpr int kGridHalf = 32;  // Cells on each side of the sensor in the local ground grid.
 
 // Neighbouring columns of one row without a step in range between them.
@@ -116,7 +117,9 @@ void LabelGround(const RangeImage& image,
     const float height = ground.Height(image.point[i]);
     const float local = lowest[cell_of(image.point[i])];
     const float base = local == kNone ? 0.0F : local;
-    if (height < std::max(base, -0.1F) + tolerance) (*labels)[i] = Label::kGround;
+    // The plane's tilt error and what grazing beams miss grow with the range.
+    const float slack = tolerance + 0.01F * image.range[i];
+    if (height < std::max(base, -0.1F) + slack) (*labels)[i] = Label::kGround;
   }
 }
 
@@ -198,7 +201,7 @@ std::vector<Label> LabelGeometrically(const RangeImage& image,
 
   // Join runs of adjacent rows that look like one stem: they overlap, at about the same range, with
   // about the same width. Runs are sorted by row, then by column.
-  std::vector<std::size_t> row_begin(static_cast<std::size_t>(image.rows) + 1, runs.size());
+  std::vector<std::size_t> row_begin(static_cast<std::size_t>(image.rows) + 2, runs.size());
   for (std::size_t i = runs.size(); i-- > 0;) row_begin[static_cast<std::size_t>(runs[i].row)] = i;
   for (std::size_t r = static_cast<std::size_t>(image.rows); r-- > 0;) {
     row_begin[r] = std::min(row_begin[r], row_begin[r + 1]);
@@ -206,11 +209,7 @@ std::vector<Label> LabelGeometrically(const RangeImage& image,
   DisjointSets sets(runs.size());
   for (std::size_t r = 0; r + 1 < static_cast<std::size_t>(image.rows); ++r) {
     for (std::size_t i = row_begin[r]; i < row_begin[r + 1]; ++i) {
-      for (std::size_t j = row_begin[r + 1]; j < row_begin[r + 2 > static_cast<std::size_t>(
-                                                               image.rows)
-                                                           ? static_cast<std::size_t>(image.rows)
-                                                           : r + 2];
-           ++j) {
+      for (std::size_t j = row_begin[r + 1]; j < row_begin[r + 2]; ++j) {
         const Run& a = runs[i];
         const Run& b = runs[j];
         const float thin = std::min(a.width, b.width);
@@ -228,7 +227,8 @@ std::vector<Label> LabelGeometrically(const RangeImage& image,
     int runs = 0;
     float roughness = 0.0F;  // Weighted by length, of the runs long enough to tell.
     int rough_weight = 0;
-    float width = 0.0F;  // Weighted by length.
+    float width = 0.0F;   // Weighted by length.
+    float height = 0.0F;  // Over the ground, weighted by length.
     Eigen::Vector3f low = Eigen::Vector3f::Constant(std::numeric_limits<float>::infinity());
     Eigen::Vector3f high = Eigen::Vector3f::Constant(-std::numeric_limits<float>::infinity());
   };
@@ -239,6 +239,7 @@ std::vector<Label> LabelGeometrically(const RangeImage& image,
     group.points += run.length;
     group.runs += 1;
     group.width += run.width * static_cast<float>(run.length);
+    if (ground) group.height += ground->Height(run.centre) * static_cast<float>(run.length);
     if (run.length >= 5) {
       group.roughness += run.roughness * static_cast<float>(run.length);
       group.rough_weight += run.length;
@@ -265,10 +266,13 @@ std::vector<Label> LabelGeometrically(const RangeImage& image,
     const float length = (group.high - group.low).norm();
     if (group.points < config.min_group_points) {
       small_points += group.points;
+    } else if (group.width > static_cast<float>(config.max_width_m) && group.runs > 1) {
+      // Wide and low is a rise of the ground, wide and high a wall. A wall seen at a slant is far
+      // from a parabola, so this comes before roughness.
+      const bool low = ground && group.height / static_cast<float>(group.points) < kRiseHeight;
+      verdict[g] = low ? Label::kGround : Label::kOther;
     } else if (rough > static_cast<float>(config.max_roughness_m)) {
       verdict[g] = Label::kLeaf;
-    } else if (group.width > static_cast<float>(config.max_width_m) && group.runs > 1) {
-      verdict[g] = Label::kOther;
     } else if (group.runs == 1 ||
                length >= static_cast<float>(config.min_elongation) * group.width) {
       verdict[g] = Label::kWood;

@@ -44,6 +44,7 @@ void GroundPlaneConfig::Validate() const {
   if (hypotheses < 1) throw std::invalid_argument("hypotheses must be >= 1");
   if (!(inlier_distance_m > 0.0)) throw std::invalid_argument("inlier_distance_m must be > 0");
   if (!(max_range_m > 0.0)) throw std::invalid_argument("max_range_m must be > 0");
+  if (!(far_range_m >= 0.0)) throw std::invalid_argument("far_range_m must be >= 0");
   if (!(min_inlier_ratio > 0.0 && min_inlier_ratio < 1.0)) {
     throw std::invalid_argument("min_inlier_ratio must be in (0, 1)");
   }
@@ -55,11 +56,13 @@ void GroundPlaneConfig::Validate() const {
   }
 }
 
-std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
-                                               const GroundPlaneConfig& config) {
+namespace {
+
+std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
+                                          const GroundPlaneConfig& config,
+                                          float max_range) {
   std::vector<std::size_t> pixels;
   pixels.reserve(image.size());
-  const float max_range = static_cast<float>(config.max_range_m);
   for (std::size_t i = 0; i < image.size(); ++i) {
     if (image.HasReturn(i) && image.range[i] <= max_range && image.point[i].allFinite()) {
       pixels.push_back(i);
@@ -172,6 +175,15 @@ std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
     return std::nullopt;
   }
   return best;
+}
+
+}  // namespace
+
+std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
+                                               const GroundPlaneConfig& config) {
+  const auto near = EstimateWithin(image, config, static_cast<float>(config.max_range_m));
+  if (near || config.far_range_m <= config.max_range_m) return near;
+  return EstimateWithin(image, config, static_cast<float>(config.far_range_m));
 }
 
 }  // namespace dendro

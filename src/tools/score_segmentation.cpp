@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <chrono>
+#include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <exception>
@@ -74,6 +75,7 @@ const std::array<float, 5> kRangeEdges = {0.0F, 4.0F, 8.0F, 16.0F, 200.0F};
 struct Score {
   Counts all;
   std::array<Counts, 4> by_range;
+  std::array<std::array<double, 5>, 5> confusion{};  ///< [truth][label], indexed as enum Label.
   std::vector<double> milliseconds;
 
   nlohmann::json Json() {
@@ -82,6 +84,10 @@ struct Score {
       std::ostringstream name;
       name << kRangeEdges[i] << "-" << kRangeEdges[i + 1] << "m";
       json["by_range"][name.str()] = by_range[i].Json();
+    }
+    const std::array<const char*, 5> names = {"none", "ground", "wood", "leaf", "other"};
+    for (std::size_t t = 1; t < 5; ++t) {
+      for (std::size_t l = 1; l < 5; ++l) json["confusion"][names[t]][names[l]] = confusion[t][l];
     }
     std::sort(milliseconds.begin(), milliseconds.end());
     const std::size_t n = milliseconds.size();
@@ -122,6 +128,8 @@ void Run(const Options& options) {
           for (std::size_t i = 0; i < scan.truth.size(); ++i) {
             if (scan.truth[i] == Label::kNone) continue;
             score.all.Add(result.label[i], scan.truth[i]);
+            score.confusion[static_cast<std::size_t>(scan.truth[i])]
+                           [static_cast<std::size_t>(result.label[i])] += 1;
             for (std::size_t k = 0; k < score.by_range.size(); ++k) {
               const float range = result.image.range[i];
               if (range >= kRangeEdges[k] && range < kRangeEdges[k + 1]) {

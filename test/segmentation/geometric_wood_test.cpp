@@ -25,6 +25,16 @@ TEST(GroundPlane, FindsHeightAndNormalInAnyAttitude) {
   }
 }
 
+TEST(GroundPlane, FoundFromHighAboveWhereAllOfItIsFar) {
+  const test::SyntheticScan scan = test::MakeScan({{4.0, 0.2, 0.15, 9.0}}, 7.5, 0.01, 5);
+  const auto ground = EstimateGroundPlane(scan.image, GroundPlaneConfig());
+  ASSERT_TRUE(ground.has_value());
+  EXPECT_NEAR(ground->offset, 7.5, 0.15);
+  GroundPlaneConfig near_only;
+  near_only.far_range_m = 0.0;
+  EXPECT_FALSE(EstimateGroundPlane(scan.image, near_only).has_value());
+}
+
 TEST(GroundPlane, SaysNothingWithoutGround) {
   test::SyntheticScan scan = test::MakeScan(kStems, 2.0, 0.01, 5);
   for (std::size_t i = 0; i < scan.image.size(); ++i) {

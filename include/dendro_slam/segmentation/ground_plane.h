@@ -21,6 +21,8 @@ struct GroundPlaneConfig {
   int hypotheses = 192;            ///< Sampled planes. >= 1.
   double inlier_distance_m = 0.12;  ///< Half thickness of the plane [m]. > 0.
   double max_range_m = 25.0;       ///< Returns considered [m]. > 0.
+  double far_range_m = 80.0;        ///< Second try where the nearer returns show no ground: high above
+                                    ///< it all of it is far away [m]. 0 to leave it out.
   double min_inlier_ratio = 0.08;  ///< Of the returns considered. In (0, 1).
   double min_column_ratio = 0.1;    ///< Of the columns, with the plane in sight. In [0, 1).
   double max_below_ratio = 0.04;   ///< Returns that may lie under the plane. In [0, 1).
@@ -31,6 +33,7 @@ struct GroundPlaneConfig {
     v("hypotheses", hypotheses);
     v("inlier_distance_m", inlier_distance_m);
     v("max_range_m", max_range_m);
+    v("far_range_m", far_range_m);
     v("min_inlier_ratio", min_inlier_ratio);
     v("min_column_ratio", min_column_ratio);
     v("max_below_ratio", max_below_ratio);
