@@ -1,0 +1,63 @@
+// Writes a map directory for the tests of the exports: make_test_map DIR small|one|empty|big
+
+#include <cmath>
+#include <cstdio>
+#include <string>
+
+#include "../topology/landmark_maker.h"
+#include "dendro_slam/io/map_directory.h"
+
+int main(int argc, char** argv) {
+  using namespace dendro;
+  using test::MakeLandmark;
+  if (argc != 3) return 2;
+  const std::string kind = argv[2];
+  MapFiles files;
+  const auto add_tree = [&](double x, double y, int branches) {
+    const auto add = [&](const Eigen::Vector3d& a, const Eigen::Vector3d& b, double r0, double r1) {
+      const Eigen::Vector3d o(x, y, 0.0);
+      files.landmarks.push_back(MakeLandmark(static_cast<int>(files.landmarks.size()), a + o, b + o, r0, r1));
+    };
+    add({0, 0, 0}, {0, 0, 5}, 0.2, 0.1);
+    for (int i = 0; i < branches; ++i) {
+      const double angle = 2.4 * i, z = 1.5 + 3.0 * i / branches;
+      const Eigen::Vector3d d(std::cos(angle), std::sin(angle), 0.4);
+      const Eigen::Vector3d base(0, 0, z);
+      add(base + 0.25 * d, base + 1.6 * d, 0.05, 0.03);
+    }
+  };
+  if (kind == "small") {
+    add_tree(0, 0, 4);
+    // A twig on the first branch, away from its middle line.
+    files.landmarks.push_back(MakeLandmark(50, {1.0, 0.08, 1.9}, {1.0, 0.9, 2.0}, 0.015, 0.012));
+    add_tree(8, 3, 2);
+    files.landmarks.back().id = 60;
+    files.landmarks.push_back(MakeLandmark(99, {4, -4, 4}, {5, -4, 4.2}, 0.02, 0.02));
+  } else if (kind == "one") {
+    files.landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 0.4}, 0.1, 0.1)};
+  } else if (kind == "big") {
+    for (int i = 0; i < 240; ++i) add_tree(8.0 * (i % 16), 8.0 * (i / 16), 10);
+  } else if (kind != "empty") {
+    return 2;
+  }
+  for (std::size_t i = 0; i < files.landmarks.size(); ++i) files.landmarks[i].id = static_cast<int>(i);
+  files.next_landmark_id = static_cast<int>(files.landmarks.size());
+  TreeTopology topology{TopologyConfig()};
+  files.model = topology.Build(files.landmarks, 1000);
+  files.topology = topology.state();
+  for (int i = 0; i < 21; ++i) {
+    StampedPose pose;
+    pose.stamp_ns = 1000000000LL + 100000000LL * i;
+    pose.T_map_lidar.linear() = Eigen::AngleAxisd(0.1 * i, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+    pose.T_map_lidar.translation() = Eigen::Vector3d(4.0, -2.0 + 0.1 * i, 1.5);
+    files.trajectory.push_back(pose);
+  }
+  try {
+    SaveMap(argv[1], files);
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "make_test_map: %s\n", error.what());
+    return 1;
+  }
+  std::printf("%zu cylinders\n", files.model.cylinders.size());
+  return 0;
+}

@@ -1,0 +1,264 @@
+"""export_map: every format is read back by an independent reader and agrees with the map's own tables."""
+
+import csv
+import math
+import os
+import subprocess
+
+import numpy as np
+import pytest
+import scipy.io
+
+BUILD = os.environ.get("DENDRO_BUILD_DIR") or os.path.join(
+    os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "build")
+EXPORT = os.path.join(BUILD, "devel", "lib", "dendro_slam", "export_map")
+MAKE = os.path.join(BUILD, "test", "make_test_map")
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    root = tmp_path_factory.mktemp("maps")
+    for kind in ("small", "one", "empty", "big"):
+        subprocess.run([MAKE, str(root / kind), kind], check=True, stdout=subprocess.DEVNULL)
+    return root
+
+
+def export(map_dir, fmt, output, *arguments, expect=0):
+    result = subprocess.run([EXPORT, str(map_dir), "-f", fmt, "-o", str(output), *arguments],
+                            capture_output=True, text=True, check=False)
+    assert result.returncode == expect, result.stderr
+    return result.stdout if expect == 0 else result.stderr
+
+
+def rows(path):
+    with open(path, newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def table(map_dir, name, tree=None):
+    return [r for r in rows(map_dir / name) if tree is None or r["tree_id"] == str(tree)]
+
+
+def frustum(row):
+    r, half = float(row["radius_m"]), 0.5 * float(row["taper_m_per_m"]) * float(row["length_m"])
+    a, b = r - half, r + half
+    return math.pi * float(row["length_m"]) / 3 * (a * a + a * b + b * b)
+
+
+def same_points(a, b):
+    """The same points in any order, to the tables' last digit."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    distance = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return a.shape == b.shape and np.all(distance.min(axis=0) < 1e-5) and np.all(distance.min(axis=1) < 1e-5)
+
+
+def check_qsm(path, map_dir, tree):
+    """A TreeQSM file against our tables, read by SciPy."""
+    qsm = scipy.io.loadmat(path)["QSM"][0, 0]
+    cylinder = {n: qsm["cylinder"][0, 0][n] for n in qsm["cylinder"][0, 0].dtype.names}
+    branch = {n: qsm["branch"][0, 0][n] for n in qsm["branch"][0, 0].dtype.names}
+    data = {n: qsm["treedata"][0, 0][n] for n in qsm["treedata"][0, 0].dtype.names}
+    ours = table(map_dir, "cylinders.csv", tree)
+    n = len(ours)
+    assert all(cylinder[k].shape == (n, 3 if k in ("start", "axis") else 1) for k in cylinder)
+    parent, extension = cylinder["parent"][:, 0], cylinder["extension"][:, 0]
+    assert (parent == 0).sum() == 1 and parent[0] == 0  # one connected tree
+    assert np.all(parent < np.arange(1, n + 1))
+    for i in range(n):
+        if extension[i] > 0:
+            assert extension[i] == i + 2 and parent[i + 1] == i + 1
+            assert cylinder["branch"][i, 0] == cylinder["branch"][i + 1, 0]
+    assert np.allclose(np.linalg.norm(cylinder["axis"], axis=1), 1.0)
+    # Every one of our cylinders is there, by its start.
+    assert same_points(cylinder["start"], [[float(r[f"start_{a}"]) for a in "xyz"] for r in ours])
+    assert cylinder["radius"].sum() == pytest.approx(sum(float(r["radius_m"]) for r in ours), rel=1e-5)
+    assert cylinder["added"].sum() == sum(r["status"] != "MEASURED" for r in ours)
+    branches = table(map_dir, "branches.csv", tree)
+    assert branch["order"].shape == (len(branches), 1)
+    assert branch["order"][0, 0] == 0 and branch["parent"][0, 0] == 0
+    assert cylinder["branch"].max() == len(branches)
+    volume = 1000 * sum(frustum(r) for r in ours)
+    assert data["TotalVolume"][0, 0] == pytest.approx(volume, rel=1e-4)
+    assert data["TrunkVolume"][0, 0] + data["BranchVolume"][0, 0] == pytest.approx(data["TotalVolume"][0, 0])
+    assert branch["volume"].sum() == pytest.approx(volume, rel=1e-4)
+    assert data["NumberBranches"][0, 0] == len(branches) - 1
+    row = table(map_dir, "trees.csv", tree)[0]
+    assert data["TreeHeight"][0, 0] == pytest.approx(float(row["height_m"]), abs=1e-5)
+    if row["dbh_m"]:
+        assert data["DBHcyl"][0, 0] == pytest.approx(float(row["dbh_m"]), abs=1e-5)
+        assert data["DBHqsm"][0, 0] == pytest.approx(float(row["dbh_m"]), abs=0.02)
+    assert data["StemTaper"].shape[0] == 2
+    assert np.all(np.diff(data["StemTaper"][0]) > 0)
+    return cylinder, branch, data
+
+
+def test_treeqsm_mat(maps, tmp_path):
+    message = export(maps / "small", "treeqsm-mat", tmp_path / "qsm.mat")
+    assert "2 files" in message and "attached to no tree" in message
+    _, _, data = check_qsm(tmp_path / "qsm_0.mat", maps / "small", 0)
+    check_qsm(tmp_path / "qsm_1.mat", maps / "small", 1)
+    # The trunk is the frustum 0.2 to 0.1 m over 5 m.
+    assert data["TrunkVolume"][0, 0] == pytest.approx(1000 * math.pi * 5 / 3 * (0.04 + 0.02 + 0.01), rel=0.01)
+    assert data["TrunkLength"][0, 0] == pytest.approx(5.0, abs=1e-6)
+    assert data["CrownAreaConv"][0, 0] > 1.0
+    export(maps / "small", "treeqsm-mat", tmp_path / "one.mat", "--tree", "1")
+    assert (tmp_path / "one.mat").read_bytes() == (tmp_path / "qsm_1.mat").read_bytes()
+
+
+def test_members_are_those_of_a_real_treeqsm_file(maps, tmp_path):
+    real = os.path.join(os.environ.get("DENDRO_SHARED_DATA", ""), "trees", "itsme_tree_1_qsm.mat")
+    if not os.path.exists(real):
+        pytest.skip("no real TreeQSM file: DENDRO_SHARED_DATA is not there")
+    export(maps / "one", "treeqsm-mat", tmp_path / "q.mat")
+    theirs, ours = (scipy.io.loadmat(p)["QSM"][0, 0] for p in (real, tmp_path / "q.mat"))
+    for part in ("cylinder", "branch"):
+        assert set(ours[part][0, 0].dtype.names) == set(theirs[part][0, 0].dtype.names)
+    assert set(ours["treedata"][0, 0].dtype.names) <= set(theirs["treedata"][0, 0].dtype.names)
+
+
+def test_treeqsm_text(maps, tmp_path):
+    export(maps / "small", "treeqsm-txt", tmp_path / "cylinder_t.txt")
+    lines = (tmp_path / "cylinder_t_0.txt").read_text().splitlines()
+    assert len(lines[0].split("\t")) == 13
+    values = np.array([[float(v) for v in line.split("\t")] for line in lines[1:]])
+    ours = table(maps / "small", "cylinders.csv", 0)
+    assert values.shape == (len(ours), 17)
+    assert values[:, 1].sum() == pytest.approx(sum(float(r["length_m"]) for r in ours), abs=1e-3)
+    assert values[0, 8] == 0 and values[0, 10] == 1 and values[0, 11] == 0
+    # rTwig: within a branch the parent is id - 1.
+    ids = np.arange(1, len(values) + 1)
+    inside = values[:, 12] > 1
+    assert np.all(values[inside, 8] == ids[inside] - 1)
+
+
+def test_simpleforest(maps, tmp_path):
+    export(maps / "small", "simpleforest", tmp_path / "sf.csv", "--tree", "0")
+    theirs, ours = rows(tmp_path / "sf.csv"), table(maps / "small", "cylinders.csv", 0)
+    assert list(theirs[0]) == ("ID,parentID,startX,startY,startZ,endX,endY,endZ,radius,length,growthLength,"
+                               "averagePointDistance,segmentID,parentSegmentID,branchOrder,"
+                               "reverseBranchOrder,branchID").split(",")
+    assert len(theirs) == len(ours)
+    total = sum(float(r["length_m"]) for r in ours)
+    assert float(theirs[0]["growthLength"]) == pytest.approx(total, abs=1e-4)
+    assert [r["parentID"] for r in theirs].count("-1") == 1
+    by_id = {r["ID"]: r for r in theirs}
+    for r in theirs[1:]:
+        parent = by_id[r["parentID"]]
+        assert float(parent["growthLength"]) > float(r["growthLength"])
+        if r["segmentID"] != parent["segmentID"]:
+            assert r["parentSegmentID"] == parent["segmentID"]
+        assert int(parent["reverseBranchOrder"]) >= int(r["reverseBranchOrder"])
+    assert theirs[0]["reverseBranchOrder"] == "3"  # trunk, branch, twig
+    assert {r["branchID"] for r in theirs} == {r["branch_id"] for r in ours}
+
+
+def test_raycloudtools(maps, tmp_path):
+    message = export(maps / "small", "raycloudtools", tmp_path / "t.txt")
+    assert "left out" in message
+    lines = [line for line in (tmp_path / "t.txt").read_text().splitlines() if not line.startswith("#")]
+    assert lines[0] == "x,y,z,radius,parent_id,section_id"
+    assert len(lines) == 3
+    for tree, line in enumerate(lines[1:]):
+        segments = [[float(v) for v in s.split(",")] for s in line.split(", ")]
+        ours = table(maps / "small", "cylinders.csv", tree)
+        assert len(segments) == len(ours) + 1
+        assert segments[0][4] == -1
+        assert all(0 <= s[4] < i for i, s in enumerate(segments) if i)
+        assert same_points([s[:3] for s in segments[1:]],
+                           [[float(r[f"end_{a}"]) for a in "xyz"] for r in ours])
+        trunk = [s for s in segments[1:] if s[5] == 0]
+        length = sum(math.dist(s[:3], segments[int(s[4])][:3]) for s in trunk)
+        assert length == pytest.approx(5.0, abs=1e-4)
+
+
+def test_treeloc(maps, tmp_path):
+    export(maps / "small", "treeloc", tmp_path / "loc", "--every", "10")
+    assert sorted(os.listdir(tmp_path / "loc")) == ["TreeManagerState_0.csv", "TreeManagerState_1.csv",
+                                                     "TreeManagerState_2.csv", "trajectory.txt"]
+    poses = np.loadtxt(tmp_path / "loc" / "trajectory.txt")
+    assert poses.shape == (3, 8) and poses[1, 0] == pytest.approx(2.0)
+    trees = table(maps / "small", "trees.csv")
+    for pose, index in zip(poses, range(3)):
+        state = rows(tmp_path / "loc" / f"TreeManagerState_{index}.csv")
+        assert len(state) == 2
+        yaw = 2 * math.atan2(pose[6], pose[7])
+        for ours, row in zip(trees, state):
+            p = np.array([float(row[f"location_{a}"]) for a in "xyz"])
+            R = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+            assert np.allclose(R @ p + pose[1:4], [float(ours[a]) for a in "xyz"], atol=1e-5)
+            axes = np.array([[float(row[f"axis_{r}{c}"]) for c in range(3)] for r in range(3)])
+            assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-5)
+            assert axes[2, 2] == pytest.approx(1.0, abs=1e-5)  # upright trunks
+            assert float(row["dbh"]) == pytest.approx(float(ours["dbh_m"]), abs=1e-5)
+
+
+def read_ply(path):
+    """A small PLY reader of its own: (vertices (n, 3), colours (n, 3), faces (m, 3))."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + 11
+    header = data[:end].decode().splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    n, m = (int(next(h for h in header if h.startswith(f"element {k}")).split()[2]) for k in ("vertex", "face"))
+    vertices = np.frombuffer(data, np.dtype([("p", "<f4", 3), ("c", "u1", 3)]), n, end)
+    faces = np.frombuffer(data, np.dtype([("n", "u1"), ("v", "<i4", 3)]), m, end + 15 * n)
+    assert len(data) == end + 15 * n + 13 * m
+    assert m == 0 or (np.all(faces["n"] == 3) and faces["v"].min() >= 0 and faces["v"].max() < n)
+    return vertices["p"], vertices["c"], faces["v"]
+
+
+@pytest.mark.parametrize("fmt", ["ply-branch", "ply-order", "ply-sigma"])
+def test_ply(maps, tmp_path, fmt):
+    export(maps / "small", fmt, tmp_path / "m.ply")
+    vertices, colors, faces = read_ply(tmp_path / "m.ply")
+    ours = table(maps / "small", "cylinders.csv")
+    assert len(vertices) == 26 * len(ours)
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    # A 12-gon has 6 / pi sin(30 degrees) of its circle's area.
+    assert volume == pytest.approx(sum(frustum(r) for r in ours) * 6 / math.pi * 0.5, rel=1e-3)
+    assert len(np.unique(colors, axis=0)) >= 2
+    if fmt == "ply-branch":
+        assert (maps / "small" / "tree.ply").read_bytes() == (tmp_path / "m.ply").read_bytes()
+
+
+def test_one_cylinder_and_none(maps, tmp_path):
+    for kind in ("treeqsm-mat", "treeqsm-txt", "simpleforest", "raycloudtools", "ply-sigma", "json"):
+        export(maps / "one", kind, tmp_path / kind)
+    check_qsm(tmp_path / "treeqsm-mat", maps / "one", 0)
+    assert len(rows(tmp_path / "simpleforest")) == 1
+    assert "holds no tree" in export(maps / "empty", "treeqsm-mat", tmp_path / "none.mat", expect=2)
+    assert not (tmp_path / "none.mat").exists()
+    export(maps / "empty", "raycloudtools", tmp_path / "none.txt")
+    export(maps / "empty", "ply-branch", tmp_path / "none.ply")
+    assert len(read_ply(tmp_path / "none.ply")[0]) == 0
+    assert "no tree 7" in export(maps / "one", "simpleforest", tmp_path / "x", "--tree", "7", expect=2)
+
+
+def test_ten_thousand_cylinders(maps, tmp_path):
+    ours = table(maps / "big", "cylinders.csv")
+    assert len(ours) > 10000
+    export(maps / "big", "raycloudtools", tmp_path / "t.txt")
+    lines = (tmp_path / "t.txt").read_text().splitlines()[2:]
+    assert len(lines) == 240
+    assert sum(line.count(", ") for line in lines) == len(ours)
+    export(maps / "big", "treeqsm-mat", tmp_path / "q.mat", "--tree", "239")
+    check_qsm(tmp_path / "q.mat", maps / "big", 239)
+    export(maps / "big", "ply-sigma", tmp_path / "m.ply")
+    assert len(read_ply(tmp_path / "m.ply")[0]) == 26 * len(ours)
+
+
+def test_tables_and_json_come_back(maps, tmp_path):
+    export(maps / "small", "csv", tmp_path / "tables")
+    for name in ("cylinders.csv", "branches.csv", "trees.csv"):
+        assert (tmp_path / "tables" / name).read_bytes() == (maps / "small" / name).read_bytes()
+    export(maps / "small", "json", tmp_path / "tree_map.json")
+    assert (tmp_path / "tree_map.json").read_bytes() == (maps / "small" / "tree_map.json").read_bytes()
+
+
+def test_bad_use_is_one_line(maps, tmp_path):
+    assert "tree_map.json" in export(tmp_path, "json", tmp_path / "x", expect=2)
+    message = export(maps / "small", "json", "/proc/none/x", expect=2)
+    assert message.count("\n") == 1
+    result = subprocess.run([EXPORT, str(maps / "small"), "-f", "dwg", "-o", "x"], capture_output=True,
+                            text=True, check=False)
+    assert result.returncode != 0 and "dwg" in result.stderr
