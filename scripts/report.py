@@ -13,6 +13,7 @@ import base64
 import html
 import io
 import os
+import re
 import sys
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
@@ -117,6 +118,42 @@ def tape_table(rows):
                  text_columns=(0, 4)) + mean
 
 
+def plain(text):
+    """A table cell of the page as plain text."""
+    text = re.sub(r"<[^>]*>", "", str(text))
+    return html.unescape(text).strip()
+
+
+def table_pages(title, page, rows_per_page=34):
+    """Figures with the rows of an HTML table made by table()."""
+    header = [plain(c) for c in re.findall(r"<th[^>]*>(.*?)</th>", page)]
+    rows = [[plain(c) for c in re.findall(r"<td[^>]*>(.*?)</td>", row)]
+            for row in re.findall(r"<tr>(<td.*?)</tr>", page)]
+    for first in range(0, max(len(rows), 1), rows_per_page):
+        part = rows[first:first + rows_per_page]
+        row_height = 0.2  # inches
+        height = 0.75 + row_height * (len(part) + 1)
+        figure = plt.figure(figsize=(11.7, height))
+        figure.text(0.02, 1.0 - 0.3 / height, title + (" (continued)" if first else ""), fontsize=12)
+        ax = figure.add_axes([0.02, 0.2 / height, 0.96, row_height * (len(part) + 1) / height])
+        ax.axis("off")
+        if not part:
+            continue
+        width = [max([len(header[i])] + [len(r[i]) for r in rows]) + 2 for i in range(len(header))]
+        total = min(1.0, sum(width) / 130)
+        drawn = ax.table(cellText=part, colLabels=header, cellLoc="right", edges="horizontal",
+                         colWidths=[w / sum(width) for w in width], bbox=[0.0, 0.0, total, 1.0])
+        drawn.auto_set_font_size(False)
+        drawn.set_fontsize(8)
+        for (row, column), cell in drawn.get_celld().items():
+            cell.set_edgecolor("#bbbbbb")
+            if column == 0:
+                cell.set_text_props(ha="left")
+            if row == 0:
+                cell.set_text_props(weight="bold")
+        yield figure
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("map_dir", metavar="MAP_DIR")
@@ -143,8 +180,22 @@ def main():
             parts.append("<h2>Against the truth</h2>" + score_table(scores))
         if tape:
             parts.append("<h2>Against the tape</h2>" + tape_table(tape))
+        tables = []  # of the PDF: before the figures
+        if map_dir.trees:
+            tables.append(("Trees", tree_table(map_dir)))
+        if scores:
+            tables.append(("Against the truth", score_table(scores)))
+        if tape:
+            tables.append(("Against the tape", tape_table(tape)))
         os.makedirs(os.path.dirname(os.path.abspath(name)), exist_ok=True)
         with PdfPages(name + ".pdf.tmp", metadata={"Title": title, "CreationDate": None}) as pdf:
+            def add_tables(which):
+                for heading, text in which:
+                    for figure in table_pages(heading, text):
+                        pdf.savefig(figure)
+                        plt.close(figure)
+
+            add_tables(tables)
             for _, caption, figure in all_figures(map_dir, truth, scores):
                 picture = io.BytesIO()
                 figure.savefig(picture, format="png", metadata={"Software": None})
@@ -153,6 +204,8 @@ def main():
                              f"<figcaption>{html.escape(caption)}</figcaption></figure>")
                 pdf.savefig(figure)
                 plt.close(figure)
+            if map_dir.branch_rows:
+                add_tables([("Branches", branch_table(map_dir))])
             if not pdf.get_pagecount():
                 figure = plt.figure(figsize=(6, 2))
                 figure.text(0.5, 0.5, "The map holds no branch.", ha="center")
