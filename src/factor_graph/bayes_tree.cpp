@@ -320,17 +320,18 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
   const int separator = clique->separator_dimension;
   const int rhs = frontal + separator;
   const int size = rhs + 1;
-  const int stride = size;
-  front_.resize(std::max(front_.size(), static_cast<std::size_t>(stride) * size));
-  std::memset(front_.data(), 0, sizeof(double) * static_cast<std::size_t>(stride) * size);
+  const int stride = FrontStride(size);
+  const std::size_t cells = static_cast<std::size_t>(stride) * stride;
+  if (front_.size() < cells) front_.resize(cells);
+  std::memset(front_.data(), 0, sizeof(double) * cells);
 
   int offset = 0;
   for (const int v : clique->variables) {
     offset_[v] = offset;
     offset += variables[v].dimension;
   }
-  for (const int f : clique->factors) AddFactor(graph_->factors[f], stride);
-  for (const int child : clique->children) AddMarginal(cliques_[child], stride);
+  for (const int f : clique->factors) AddFactor(graph_->factors[f], stride, rhs);
+  for (const int child : clique->children) AddMarginal(cliques_[child], stride, rhs);
 
   limits_.resize(std::max(limits_.size(), static_cast<std::size_t>(frontal)));
   for (int j = 0; j < frontal; ++j) {
@@ -361,7 +362,12 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
     }
   }
 
-  clique->conditional.assign(front_.begin(), front_.begin() + static_cast<long>(stride) * frontal);
+  clique->conditional.resize(static_cast<std::size_t>(size) * frontal);
+  for (int j = 0; j < frontal; ++j) {
+    std::memcpy(clique->conditional.data() + static_cast<std::size_t>(j) * size,
+                front_.data() + static_cast<std::size_t>(j) * stride,
+                sizeof(double) * static_cast<std::size_t>(size));
+  }
   if (separator > 0) {
     const int m = separator + 1;
     clique->marginal.resize(static_cast<std::size_t>(m) * (m + 1) / 2);
@@ -375,9 +381,8 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
   return true;
 }
 
-void BayesTree::AddFactor(const FactorRecord& factor, int stride) {
+void BayesTree::AddFactor(const FactorRecord& factor, int stride, int rhs) {
   const std::vector<VariableRecord>& variables = graph_->variables;
-  const int rhs = stride - 1;
   const double* source = factor.hessian.data();
   const int count = static_cast<int>(factor.variables.size());
   for (int a = 0; a < count; ++a) {
@@ -404,7 +409,7 @@ void BayesTree::AddFactor(const FactorRecord& factor, int stride) {
   }
 }
 
-void BayesTree::AddMarginal(const Clique& child, int stride) {
+void BayesTree::AddMarginal(const Clique& child, int stride, int rhs) {
   const std::vector<VariableRecord>& variables = graph_->variables;
   std::vector<Run>& runs = runs_;
   runs.clear();
@@ -417,10 +422,10 @@ void BayesTree::AddMarginal(const Clique& child, int stride) {
       runs.push_back({offset_[v], length});
     }
   }
-  if (!runs.empty() && runs.back().target + runs.back().length == stride - 1) {
+  if (!runs.empty() && runs.back().target + runs.back().length == rhs) {
     runs.back().length += 1;
   } else {
-    runs.push_back({stride - 1, 1});
+    runs.push_back({rhs, 1});
   }
   const double* in = child.marginal.data();
   for (std::size_t a = 0; a < runs.size(); ++a) {

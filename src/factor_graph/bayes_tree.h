@@ -99,8 +99,8 @@ class BayesTree {
 
   int NewClique();
   bool FactorizeClique(Clique* clique, const Damping& damping, int* failed);
-  void AddFactor(const FactorRecord& factor, int stride);
-  void AddMarginal(const Clique& child, int stride);
+  void AddFactor(const FactorRecord& factor, int stride, int rhs);
+  void AddMarginal(const Clique& child, int stride, int rhs);
 
   GraphStore* graph_;
   std::vector<Clique> cliques_;

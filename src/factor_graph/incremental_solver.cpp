@@ -38,6 +38,9 @@ void Require(bool ok, const char* field, const char* rule) {
 // The error is a sum of rounded terms: a rise within this part of it is no rise.
 constexpr double kRounding = 1e-13;
 
+// A step that raises the error by less than this factor is shortened before it is damped.
+constexpr double kSmallRise = 1.1;
+
 }  // namespace
 
 void SolverConfig::Validate() const {
@@ -88,6 +91,7 @@ class IncrementalSolver::Impl {
   struct Step {
     std::vector<int> variables;
     std::vector<double> delta;      // Before, kMaxTangentDimension each.
+    std::vector<double> moved;      // After, of the whole step.
     std::vector<double> published;  // Before.
     std::vector<Value> estimate;    // Before.
     std::vector<int> factors;
@@ -114,6 +118,7 @@ class IncrementalSolver::Impl {
   void ComputeWeights();
   void Solve(double threshold, Step* step);
   void Undo(const Step& step);
+  void Shorten(const Step& step, double fraction);
   void RebuildTree();
   void TakeBack(const std::vector<int>& factors, const std::vector<int>& variables);
   void RestoreTree();
@@ -450,6 +455,7 @@ void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
         step->published.insert(step->published.end(), std::begin(v.published), std::end(v.published));
         step->estimate.push_back(v.estimate);
         std::copy(x, x + v.dimension, v.delta);
+        step->moved.insert(step->moved.end(), std::begin(v.delta), std::end(v.delta));
         v.estimate = Retract(v.theta, v.delta);
         if (publish) {
           std::copy(x, x + v.dimension, v.published);
@@ -483,6 +489,18 @@ void IncrementalSolver::Impl::Undo(const Step& step) {
   }
   for (std::size_t i = 0; i < step.factors.size(); ++i) errors_[step.factors[i]] = step.errors[i];
   for (const int c : step.cliques) tree_.clique(c).unsolved = true;
+}
+
+// Takes only a part of an undone step. Its cliques stay unsolved: the next step starts from here.
+void IncrementalSolver::Impl::Shorten(const Step& step, double fraction) {
+  for (std::size_t i = 0; i < step.variables.size(); ++i) {
+    VariableRecord& v = graph_.variables[step.variables[i]];
+    const double* before = step.delta.data() + i * kMaxTangentDimension;
+    const double* after = step.moved.data() + i * kMaxTangentDimension;
+    for (int k = 0; k < v.dimension; ++k) v.delta[k] = before[k] + fraction * (after[k] - before[k]);
+    v.estimate = Retract(v.theta, v.delta);
+  }
+  for (const int f : step.factors) errors_[f] = EvaluateError(f);
 }
 
 // A new tree over the whole graph at the present linearisation points, without damping.
@@ -655,6 +673,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
 
     // Steps, with damping once one was refused.
     std::vector<int> touched;
+    bool damped = lambda_ > 0.0;
     Step step;
     for (result.iterations = 1;; ++result.iterations) {
       if (lambda_ > 0.0) ComputeWeights();
@@ -674,6 +693,17 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       }
       Undo(step);
       ++result.steps_refused;
+      // A small rise: the linearisation is stale, the direction is good. A part of the step.
+      if (error <= kSmallRise * result.error_before) {
+        double fraction = 0.5;
+        bool accepted = false;
+        for (; fraction > 0.1 && !accepted; fraction *= 0.5) {
+          Shorten(step, fraction);
+          accepted = Error() <= result.error_before;
+          if (!accepted) Undo(step);
+        }
+        if (accepted) break;
+      }
       if (result.iterations >= config_.max_iterations || lambda_ >= config_.lambda_max) break;
       // Once more from the present estimate, linearised there, with more damping.
       if (result.steps_refused == 1) {
@@ -696,9 +726,10 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
         }
       }
       lambda_ = std::max(config_.lambda_initial, lambda_ * config_.lambda_up);
+      damped = true;
       for (const int c : touched) tree_.MarkDirty(c);
     }
-    if (result.damping > 0.0 || result.steps_refused > 0) {
+    if (damped) {
       for (const int c : tree_.factorized()) {
         for (int i = 0; i < tree_.clique(c).num_frontal; ++i) {
           damped_variables_.push_back(tree_.clique(c).variables[i]);
