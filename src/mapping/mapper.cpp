@@ -146,6 +146,7 @@ class Mapper::Impl {
 
   // Motion since the key frame.
   UncertainMotion since_kf;                 // the chain of the best steps
+  UncertainMotion odometry_since_kf;        // the same without what the map corrected
   std::optional<UncertainMotion> icp_since_kf;
   std::optional<Eigen::Isometry3d> T_odom_kf;  // unset when VIO was absent or rejected since
   std::int64_t last_stamp_ns = 0;
@@ -372,19 +373,20 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
           NoiseModel::Covariance(vio.covariance).WithKernel(RobustKernel::Huber(3.0))));
       any = true;
     }
-    if (icp_since_kf) {
+    if (icp_since_kf && any) {
       factors.push_back(std::make_shared<BetweenFactor>(
           PoseKey(index - 1),
           PoseKey(index),
           icp_since_kf->T,
           NoiseModel::Covariance(icp_since_kf->covariance).WithKernel(RobustKernel::Cauchy(3.0))));
-      any = true;
     }
     if (!any) {
-      factors.push_back(std::make_shared<BetweenFactor>(PoseKey(index - 1),
-                                                        PoseKey(index),
-                                                        h.kf_now.T,
-                                                        NoiseModel::Covariance(h.kf_now.covariance)));
+      // VIO was not there all the way: the chain of what there was, step by step.
+      factors.push_back(std::make_shared<BetweenFactor>(
+          PoseKey(index - 1),
+          PoseKey(index),
+          odometry_since_kf.T,
+          NoiseModel::Covariance(odometry_since_kf.covariance).WithKernel(RobustKernel::Huber(3.0))));
     }
   }
 
@@ -432,6 +434,7 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
   key_frame_stamp_ns = input.stamp_ns;
   T_map_kf = solver.Estimate<Eigen::Isometry3d>(PoseKey(index));
   since_kf = UncertainMotion{};
+  odometry_since_kf = UncertainMotion{};
   icp_since_kf = UncertainMotion{};
   T_odom_kf = input.T_odom_lidar;
   MaintainMap();
@@ -673,7 +676,8 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     } else if (vio) {
       add(*vio, true, false);
     } else if (icp) {
-      add(*icp, false, true);
+      // Where ICP knows little, the motion before goes on.
+      add(velocity ? Fuse(*icp, blind) : *icp, false, true);
     } else {
       add(blind, false, false);
     }
@@ -693,6 +697,7 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     best = std::move(hypotheses[chosen]);
     if (suspicious && vio && !best.uses_vio) result.odometry_rejected = true;
 
+    odometry_since_kf = Compose(odometry_since_kf, best.step);
     since_kf = best.kf_now;
     since_kf.T = best.T_kf_lidar;
     if (best.uses_vio && !T_odom_kf) best.uses_vio = false;
@@ -705,7 +710,9 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     const Eigen::Isometry3d step = trajectory.back().key_frame == num_key_frames - 1
                                        ? trajectory.back().T_kf_lidar.inverse() * best.T_kf_lidar
                                        : best.T_kf_lidar;
-    velocity = LogSe3(step) / dt;
+    // Smoothed: the difference of two poses a tenth of a second apart is mostly noise.
+    const Vector6d now = LogSe3(step) / dt;
+    velocity = velocity ? Vector6d(0.6 * *velocity + 0.4 * now) : now;
     last_score = 0.7 * last_score + 0.3 * best.score;
 
     const Vector6d since = LogSe3(best.T_kf_lidar);

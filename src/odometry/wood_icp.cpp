@@ -183,7 +183,10 @@ bool FitSurface(const ScanPixels& scan,
     if (r < 0 || r >= scan.rows) continue;
     // Rings get farther apart with range; the image, not the distance, says what is a neighbour.
     const float vertical = ring_gap * static_cast<float>(std::abs(dr));
-    const float limit2 = radius * radius + 2.25F * vertical * vertical;
+    // Ground and walls are met at a slant, their rings lie several times the spacing apart; the fit of
+    // a plane below decides. A branch leans less.
+    const float slant = mask == 1 ? 20.0F : 2.25F;
+    const float limit2 = radius * radius + slant * vertical * vertical;
     bool any = false;
     for (int k = -4; k <= 4; ++k) {
       int c = col + k * stride;
@@ -192,7 +195,9 @@ bool FitSurface(const ScanPixels& scan,
       if ((scan.usable[pixel] & mask) == 0) continue;
       const Eigen::Vector3f d = scan.point[pixel] - p;
       if (d.squaredNorm() > limit2) continue;
-      if (std::abs(scan.point[pixel].norm() - range) > radius + vertical) continue;
+      if (std::abs(scan.point[pixel].norm() - range) > radius + std::sqrt(slant / 2.25F) * vertical) {
+        continue;
+      }
       mean += d;
       scatter += d * d.transpose();
       ++count;
@@ -206,18 +211,10 @@ bool FitSurface(const ScanPixels& scan,
       scatter / static_cast<float>(count) - mean * mean.transpose();
   Eigen::SelfAdjointEigenSolver<Eigen::Matrix3f> eigen;
   eigen.computeDirect(covariance);
-  const Eigen::Vector3f view = p / range;
   out->position = p;
-  if (rings < 2) {
-    // One ring only: its tangent is known, the direction across the rings is not. What is left is
-    // the part of the viewing direction perpendicular to the tangent.
-    const Eigen::Vector3f tangent = eigen.eigenvectors().col(2);
-    Eigen::Vector3f normal = view - tangent * tangent.dot(view);
-    if (normal.norm() < 0.2F) return false;
-    out->shape = Shape::kPlane;
-    out->direction = normal.normalized();
-    return true;
-  }
+  // One ring alone does not tell its surface: a ring on the ground would look like a wall that moves
+  // with the sensor.
+  if (rings < 2) return false;
   const Eigen::Vector3f values = eigen.eigenvalues().cwiseMax(1e-8F);
   if (values[1] < 0.04F * values[2] && values[1] < 9.0F * values[0]) {
     out->shape = Shape::kLine;
@@ -225,6 +222,7 @@ bool FitSurface(const ScanPixels& scan,
     return true;
   }
   if (values[0] > 0.5F * values[1]) return false;  // a clump
+  if (mask == 1 && values[0] > 0.0025F) return false;  // rings on different things
   out->shape = Shape::kPlane;
   out->direction = eigen.eigenvectors().col(0);
   return true;
@@ -317,7 +315,30 @@ struct WoodIcp::State {
   bool target_is_all = false;
   KdTree tree;
 
-  std::optional<RelativeMotion> last_motion;
+  // The lidar's velocity [rad/s, m/s] as a Kalman filter sees it: the guess when nobody gives one. A
+  // direction that the scans do not tell keeps its velocity instead of wandering.
+  bool has_twist = false;
+  Vector6d twist = Vector6d::Zero();
+  Matrix6d twist_covariance = Matrix6d::Zero();
+
+  void FilterTwist(const RelativeMotion& motion, double dt) {
+    const Vector6d measured = LogSe3(motion.T_from_to) / dt;
+    const Matrix6d R = motion.covariance / (dt * dt);
+    constexpr double kAcceleration = 3.0;  // per axis, one sigma [rad/s^2, m/s^2]
+    if (!has_twist) {
+      // At rest until told otherwise, give or take a walking pace.
+      twist.setZero();
+      twist_covariance = Matrix6d::Identity() * 2.0;
+      has_twist = true;
+    } else {
+      twist_covariance.diagonal().array() += kAcceleration * kAcceleration * dt * dt;
+    }
+    const Matrix6d S = twist_covariance + R;
+    const Matrix6d K = twist_covariance * S.ldlt().solve(Matrix6d::Identity());
+    twist += K * (measured - twist);
+    twist_covariance -= K * twist_covariance;
+    twist_covariance = 0.5 * (twist_covariance + twist_covariance.transpose()).eval();
+  }
 
   void SetTarget(bool all) {
     target = BuildSurfaces(*previous, all, config.max_target_points, config);
@@ -518,8 +539,9 @@ std::optional<RelativeMotion> WoodIcp::AddScan(
     s.status = WoodIcpStatus::kFirstScan;
   } else if (current.stamp_ns <= s.previous->stamp_ns) {
     s.status = WoodIcpStatus::kTimeNotAhead;
-    s.last_motion.reset();
+    s.has_twist = false;
   } else {
+    const double dt = 1e-9 * static_cast<double>(current.stamp_ns - s.previous->stamp_ns);
     const int wood = std::min(current.wood_count, s.previous->wood_count);
     const bool all = s.config.points == "all" || wood < s.config.use_all_points_below_wood_count;
     s.used_all = all;
@@ -533,12 +555,8 @@ std::optional<RelativeMotion> WoodIcp::AddScan(
       Eigen::Isometry3d guess = Eigen::Isometry3d::Identity();
       if (T_prev_cur_guess && T_prev_cur_guess->matrix().allFinite()) {
         guess = *T_prev_cur_guess;
-      } else if (s.last_motion) {
-        // The motion before goes on, in proportion to the time.
-        const double before =
-            static_cast<double>(s.last_motion->to_stamp_ns - s.last_motion->from_stamp_ns);
-        const double now = static_cast<double>(current.stamp_ns - s.previous->stamp_ns);
-        guess = ExpSe3(LogSe3(s.last_motion->T_from_to) * std::min(now / before, 3.0));
+      } else if (s.has_twist) {
+        guess = ExpSe3(s.twist * std::min(dt, 0.5));
       }
       // An even choice of the source returns; the target keeps all of its own.
       const std::size_t max_points = static_cast<std::size_t>(s.config.max_points);
@@ -553,7 +571,11 @@ std::optional<RelativeMotion> WoodIcp::AddScan(
         motion = s.Register(current, current_surfaces, guess);
       }
     }
-    s.last_motion = motion;
+    if (motion) {
+      s.FilterTwist(*motion, dt);
+    } else {
+      s.has_twist = false;
+    }
   }
 
   s.previous = std::move(current);

@@ -15,8 +15,8 @@ namespace dendro {
 /// Settings of Mapper.
 struct MapperConfig {
   // Key frames: a scan becomes one when any threshold is passed.
-  double key_frame_distance_m = 0.25;   ///< Travelled since the last one [m]. > 0.
-  double key_frame_angle_deg = 8.0;     ///< Turned since the last one [deg]. > 0.
+  double key_frame_distance_m = 0.4;    ///< Travelled since the last one [m]. > 0.
+  double key_frame_angle_deg = 10.0;    ///< Turned since the last one [deg]. > 0.
   double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
 
   // Odometry. The messages' own covariances do not tell the drift.
@@ -37,8 +37,8 @@ struct MapperConfig {
 
   // Observations.
   double observation_scale = 1.5;       ///< The fits' sigmas are multiplied by this. > 0.
-  double observation_axis_floor_deg = 0.3;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
-  double observation_offset_floor_m = 0.004;  ///< Added to the line's sigma [m]. >= 0.
+  double observation_axis_floor_deg = 0.1;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
+  double observation_offset_floor_m = 0.002;  ///< Added to the line's sigma [m]. >= 0.
   double robust_width = 2.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
                                         ///< weight (Huber). > 0.
   double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
