@@ -212,9 +212,19 @@ bool FitSurface(const ScanPixels& scan,
   Eigen::SelfAdjointEigenSolver<Eigen::Matrix3f> eigen;
   eigen.computeDirect(covariance);
   out->position = p;
-  // One ring alone does not tell its surface: a ring on the ground would look like a wall that moves
-  // with the sensor.
-  if (rings < 2) return false;
+  if (rings < 2) {
+    // One ring only: its tangent is known, the direction across the rings is not. On wood what is
+    // left is the part of the viewing direction perpendicular to the tangent; a ring on the ground
+    // would look like a wall that moves with the sensor.
+    if (mask == 1) return false;
+    const Eigen::Vector3f view = p / range;
+    const Eigen::Vector3f tangent = eigen.eigenvectors().col(2);
+    const Eigen::Vector3f normal = view - tangent * tangent.dot(view);
+    if (normal.norm() < 0.2F) return false;
+    out->shape = Shape::kPlane;
+    out->direction = normal.normalized();
+    return true;
+  }
   const Eigen::Vector3f values = eigen.eigenvalues().cwiseMax(1e-8F);
   if (values[1] < 0.04F * values[2] && values[1] < 9.0F * values[0]) {
     out->shape = Shape::kLine;
