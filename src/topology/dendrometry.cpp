@@ -16,26 +16,22 @@ double RadiusAtEnd(const MapCylinder& c) {
   return std::max(0.0, c.radius_m + 0.5 * c.taper_m_per_m * c.Length());
 }
 
-const MapBranch* FindBranch(const TreeModel& model, int id) {
-  for (const MapBranch& branch : model.branches) {
-    if (branch.id == id) return &branch;
-  }
-  return nullptr;
-}
-
-std::map<int, const MapCylinder*> CylindersById(const TreeModel& model) {
-  std::map<int, const MapCylinder*> by_id;
-  for (const MapCylinder& c : model.cylinders) by_id[c.id] = &c;
-  return by_id;
+// The entry with an id in a list sorted by id, or null.
+template <class T>
+const T* FindById(const std::vector<T>& sorted, int id) {
+  const auto it = std::lower_bound(
+      sorted.begin(), sorted.end(), id, [](const T& entry, int value) { return entry.id < value; });
+  return it != sorted.end() && it->id == id ? &*it : nullptr;
 }
 
 // The trunk's cylinders from base to tip.
 std::vector<const MapCylinder*> Stem(const TreeModel& model, const MapTree& tree) {
   std::vector<const MapCylinder*> stem;
-  const MapBranch* trunk = FindBranch(model, tree.trunk_branch_id);
+  const MapBranch* trunk = FindById(model.branches, tree.trunk_branch_id);
   if (trunk == nullptr) return stem;
-  const auto by_id = CylindersById(model);
-  for (const int id : trunk->cylinder_ids) stem.push_back(by_id.at(id));
+  for (const int id : trunk->cylinder_ids) {
+    if (const MapCylinder* cylinder = FindById(model.cylinders, id)) stem.push_back(cylinder);
+  }
   return stem;
 }
 

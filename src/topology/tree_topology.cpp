@@ -209,6 +209,9 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
       const Piece& a = pieces[i];
       const Piece& b = pieces[j];
       if (std::abs(a.landmark->cylinder.axis.dot(b.landmark->cylinder.axis)) < cos_bend) continue;
+      // No end of one is anywhere near an end of the other.
+      const double far = config.join_gap_m + config.join_offset_m + 1.0 + a.length + b.length;
+      if ((a.landmark->cylinder.point - b.landmark->cylinder.point).squaredNorm() > 4.0 * far * far) continue;
       for (int e = 0; e < 2; ++e) {
         for (int f = 0; f < 2; ++f) {
           const Vector3d u = a.Outward(e), v = b.Outward(f);

@@ -5,7 +5,7 @@
 
 #include "dendro_slam/mapping/tree_model.h"
 
-/// Measures of trees from their cylinders.
+/// Measures of trees from their cylinders. The lists of a model are sorted by id, as TreeTopology builds them.
 namespace dendro {
 
 /// Diameter of a stem at one height.
