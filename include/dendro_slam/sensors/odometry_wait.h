@@ -49,7 +49,7 @@ class OdometryWait {
     if (waiting_.empty()) return std::nullopt;
     const bool covered = odometry_ns_ && waiting_.front().need_ns <= *odometry_ns_;
     if (!covered && *newest_data_ns_ - *silent_since_ns_ <= timeout_ns_) return std::nullopt;
-    Item item = std::move(waiting_.front().item);
+    std::optional<Item> item(std::in_place, std::move(waiting_.front().item));
     waiting_.pop_front();
     return item;
   }

@@ -1,0 +1,161 @@
+#pragma once
+
+#include <stdexcept>
+#include <string>
+
+#include "dendro_slam/mapping/pipeline.h"
+#include "dendro_slam/ros/lidar_mount.h"
+#include "dendro_slam/ros/params.h"
+
+/// Parameters of the nodelets: those of the stage, and what only a node needs. map_bag reads the same
+/// files.
+namespace dendro_ros {
+
+/// Refuses a queue that holds nothing.
+inline void CheckQueueSize(int queue_size) {
+  if (queue_size < 1) throw std::invalid_argument("queue_size must be at least 1");
+}
+
+struct WoodSegmentationNodeConfig {
+  int queue_size = 20;        ///< Scans waiting at most; older ones are dropped and counted. >= 1.
+  bool use_odometry = true;   ///< False: the sweep's motion stays in the scans.
+  LidarMountConfig lidar_mount;
+  dendro::WoodSegmentationConfig stage;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    stage.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    v("use_odometry", use_odometry);
+    v("lidar_mount", lidar_mount);
+    stage.Visit(v);
+  }
+};
+
+struct BranchSeparationNodeConfig {
+  int queue_size = 20;  ///< Scans waiting at most; older ones are dropped and counted. >= 1.
+  dendro::BranchSeparatorConfig stage;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    stage.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    stage.Visit(v);
+  }
+};
+
+struct CylinderFittingNodeConfig {
+  int queue_size = 20;  ///< Scans waiting at most; older ones are dropped and counted. >= 1.
+  dendro::CylinderFitterConfig stage;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    stage.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    stage.Visit(v);
+  }
+};
+
+struct WoodIcpNodeConfig {
+  int queue_size = 20;                     ///< Scans waiting at most. >= 1.
+  std::string odom_frame = "icp_odom";     ///< Frame of the chained pose.
+  dendro::WoodIcpConfig stage;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    stage.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    v("odom_frame", odom_frame);
+    stage.Visit(v);
+  }
+};
+
+struct TreeMappingNodeConfig {
+  int queue_size = 20;                ///< Scans waiting at most; older ones are dropped. >= 1.
+  bool use_odometry = true;           ///< False: ICP alone.
+  bool use_icp = true;                ///< False: odometry alone.
+  std::string map_frame = "map";      ///< Frame of the map.
+  std::string output_directory = "";  ///< Where save_map writes when its request names no folder.
+  bool publish_tf = true;             ///< Publish map -> odom (map -> lidar without odometry).
+  bool publish_odometry_tf = false;   ///< Publish odom -> body too, where nobody else does.
+  LidarMountConfig lidar_mount;
+  dendro::TreeMappingConfig stage;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    if (map_frame.empty()) throw std::invalid_argument("map_frame must not be empty");
+    stage.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    v("use_odometry", use_odometry);
+    v("use_icp", use_icp);
+    v("map_frame", map_frame);
+    v("output_directory", output_directory);
+    v("publish_tf", publish_tf);
+    v("publish_odometry_tf", publish_odometry_tf);
+    v("lidar_mount", lidar_mount);
+    stage.Visit(v);
+  }
+};
+
+struct MapVisualizationNodeConfig {
+  std::string color = "branch";  ///< Colour of the cylinders: branch, order or sigma.
+  bool labels = true;            ///< Radius and sigma of every branch in cm.
+  bool skeleton = true;          ///< Centre lines.
+
+  void Validate() const {
+    if (color != "branch" && color != "order" && color != "sigma") {
+      throw std::invalid_argument("color must be branch, order or sigma, got '" + color + "'");
+    }
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("color", color);
+    v("labels", labels);
+    v("skeleton", skeleton);
+  }
+};
+
+/// All of them, a section per nodelet: what one configuration file may hold.
+struct NodesConfig {
+  WoodSegmentationNodeConfig wood_segmentation;
+  BranchSeparationNodeConfig branch_separation;
+  CylinderFittingNodeConfig cylinder_fitting;
+  WoodIcpNodeConfig wood_icp;
+  TreeMappingNodeConfig tree_mapping;
+  MapVisualizationNodeConfig map_visualization;
+
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("wood_segmentation", wood_segmentation);
+    v("branch_separation", branch_separation);
+    v("cylinder_fitting", cylinder_fitting);
+    v("wood_icp", wood_icp);
+    v("tree_mapping", tree_mapping);
+    v("map_visualization", map_visualization);
+  }
+
+  dendro::PipelineConfig Pipeline() const {
+    return {wood_segmentation.stage,
+            branch_separation.stage,
+            cylinder_fitting.stage,
+            wood_icp.stage,
+            tree_mapping.stage};
+  }
+};
+
+}  // namespace dendro_ros
