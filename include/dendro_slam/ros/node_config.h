@@ -6,6 +6,9 @@
 #include "dendro_slam/mapping/pipeline.h"
 #include "dendro_slam/ros/lidar_mount.h"
 #include "dendro_slam/ros/params.h"
+#include "dendro_slam/sensors/scan_assembler.h"
+#include "dendro_slam/sensors/vlp16_clock.h"
+#include "dendro_slam/sim/lidar_simulator.h"
 
 /// Parameters of the nodelets: those of the stage, and what only a node needs. map_bag reads the same
 /// files.
@@ -127,6 +130,54 @@ struct MapVisualizationNodeConfig {
     v("color", color);
     v("labels", labels);
     v("skeleton", skeleton);
+  }
+};
+
+struct Vlp16DecoderNodeConfig {
+  int queue_size = 50;             ///< Packet messages waiting at most. >= 1.
+  std::string frame = "velodyne";  ///< Frame of the clouds where the packets name none.
+  dendro::Vlp16ClockConfig clock;
+  dendro::ScanAssemblerConfig assembler;
+
+  void Validate() const {
+    CheckQueueSize(queue_size);
+    clock.Validate();
+    assembler.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("queue_size", queue_size);
+    v("frame", frame);
+    v("clock", clock);
+    v("assembler", assembler);
+  }
+};
+
+struct LidarSimulatorNodeConfig {
+  std::string scene = "";      ///< Scene file; empty: nothing is simulated.
+  std::string path = "";       ///< Flight-path file.
+  std::string odometry = "";   ///< t265, mavros or none; empty: as the path says.
+  int seed = 1;                ///< Of every random effect.
+  double rate = 1.0;           ///< Speed; 1 is real time. > 0.
+  bool publish_clock = false;  ///< Publish /clock with the simulated time.
+  dendro::LidarSimulatorConfig lidar;
+
+  void Validate() const {
+    if (!(rate > 0.0)) throw std::invalid_argument("rate must be positive");
+    if (scene.empty() != path.empty()) {
+      throw std::invalid_argument("scene and path must be given together");
+    }
+    lidar.Validate();
+  }
+  template <class Visitor>
+  void Visit(Visitor&& v) {
+    v("scene", scene);
+    v("path", path);
+    v("odometry", odometry);
+    v("seed", seed);
+    v("rate", rate);
+    v("publish_clock", publish_clock);
+    v("lidar", lidar);
   }
 };
 
