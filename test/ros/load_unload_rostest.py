@@ -1,0 +1,69 @@
+#!/usr/bin/python3
+"""Loads and unloads every class that nodelet_plugins.xml names into the running manager."""
+import pathlib
+import subprocess
+import sys
+import time
+import unittest
+import xml.etree.ElementTree
+
+import rosgraph
+import rospy
+import rostest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+SCENE = ["_scene:=" + str(ROOT / "config/scenes/thesis_tree.yaml"),
+         "_path:=" + str(ROOT / "config/paths/thesis_quadrangle.yaml")]
+
+
+def manager_topics():
+    published, subscribed, _ = rosgraph.Master("/load_unload").getSystemState()
+    return {(kind, topic) for kind, table in (("out", published), ("in", subscribed))
+            for topic, nodes in table if "/manager" in nodes}
+
+
+def wait_for(condition, timeout_s=20.0):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+class LoadUnloadTest(unittest.TestCase):
+    def classes(self):
+        tree = xml.etree.ElementTree.parse(ROOT / "nodelet_plugins.xml")
+        return [c.get("name") for c in tree.getroot().iter("class")]
+
+    def test_every_class_loads_and_unloads(self):
+        self.assertTrue(wait_for(lambda: any("bond" in t for _, t in manager_topics())))
+        self.assertEqual(len(self.classes()), 8)
+        for name in self.classes():
+            with self.subTest(name):
+                before = manager_topics()
+                node = name.split("/")[1].lower()
+                extra = SCENE if name.endswith("LidarSimulator") else []
+                loader = subprocess.Popen(
+                    ["rosrun", "nodelet", "nodelet", "load", name, "manager", "__name:=" + node, *extra],
+                    stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+                loaded = wait_for(lambda: len(manager_topics() - before) >= 2)
+                time.sleep(1.0)
+                alive = loader.poll() is None
+                loader.terminate()
+                output = loader.communicate(timeout=20)[0]
+                self.assertTrue(loaded and alive, f"{name} did not load:\n{output}")
+                self.assertTrue(wait_for(lambda: manager_topics() <= before),
+                                f"{name} did not unload: {manager_topics() - before}")
+
+    def test_unknown_parameter_is_refused(self):
+        loader = subprocess.run(
+            ["rosrun", "nodelet", "nodelet", "load", "dendro_slam/WoodIcp", "manager",
+             "__name:=misspelled", "_max_rang_m:=3.0"],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60)
+        self.assertNotEqual(loader.returncode, 0)
+
+
+if __name__ == "__main__":
+    rospy.init_node("load_unload_rostest")
+    rostest.rosrun("dendro_slam", "load_unload", LoadUnloadTest, sys.argv)

@@ -1,0 +1,128 @@
+#!/usr/bin/python3
+"""simulate_bag, map_bag and pcap_to_bag as a user runs them: results, determinism, clear errors."""
+import filecmp
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TOOLS = next(pathlib.Path(base) / "lib/dendro_slam" for base in
+             os.environ["CMAKE_PREFIX_PATH"].split(":")
+             if (pathlib.Path(base) / "lib/dendro_slam/map_bag").exists())
+SHARED = pathlib.Path(os.environ.get("DENDRO_SHARED_DATA", ROOT.parent / "shared/data"))
+SCENE = ROOT / "config/scenes/thesis_tree.yaml"
+PATH = ROOT / "config/paths/thesis_quadrangle.yaml"
+
+
+def run(name, *args, timeout=300):
+    return subprocess.run([TOOLS / name, *map(str, args)], capture_output=True, text=True,
+                          timeout=timeout)
+
+
+def good(name, *args):
+    result = run(name, *args)
+    assert result.returncode == 0, result.stderr
+    return result
+
+
+def one_line_error(result, *words):
+    assert result.returncode != 0
+    lines = result.stderr.strip().splitlines()
+    assert lines, result
+    for word in words:
+        assert word in lines[-1], lines
+    assert len(lines[-1]) < 2000
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bag") / "flight.bag"
+    good("simulate_bag", SCENE, PATH, "-o", path, "--duration", 3, "--packets", "--pcap",
+         path.with_suffix(".pcap"))
+    return path
+
+
+@pytest.mark.parametrize("name", ["simulate_bag", "map_bag", "pcap_to_bag"])
+def test_help(name):
+    assert "Usage" in good(name, "--help").stdout
+
+
+def test_truth_is_beside_the_bag(bag):
+    truth = bag.with_suffix(".truth")
+    assert {p.name for p in truth.iterdir()} >= {"scene.yaml", "trajectory.tum", "hits.csv", "labels.bin"}
+    assert len((truth / "trajectory.tum").read_text().strip().splitlines()) >= 29
+
+
+def test_same_seed_same_bag_whatever_the_threads(bag, tmp_path):
+    again = tmp_path / "flight.bag"
+    good("simulate_bag", SCENE, PATH, "-o", again, "--duration", 3, "--packets", "--threads", 1)
+    assert filecmp.cmp(bag, again, shallow=False)
+
+
+def test_map_bag_gives_the_same_bytes_twice(bag, tmp_path):
+    for name in ("a", "b"):
+        good("map_bag", bag, "-o", tmp_path / name, "--per-scan", "--config", ROOT / "config")
+    names = {p.name for p in (tmp_path / "a").iterdir()}
+    assert names >= {"tree_map.json", "cylinders.csv", "branches.csv", "trees.csv", "trajectory.tum",
+                     "tree.ply", "timing.json", "scan_cylinders.csv", "scan_labels.bin"}
+    for name in names - {"timing.json"}:
+        assert filecmp.cmp(tmp_path / "a" / name, tmp_path / "b" / name, shallow=False), name
+    timing = json.loads((tmp_path / "a/timing.json").read_text())
+    assert timing
+
+
+def test_map_bag_goes_on_with_a_map(bag, tmp_path):
+    good("map_bag", bag, "-o", tmp_path / "a")
+    good("map_bag", bag, "-o", tmp_path / "b", "--load", tmp_path / "a")
+
+
+def test_bag_without_odometry(tmp_path):
+    path = tmp_path / "none.bag"
+    good("simulate_bag", SCENE, PATH, "-o", path, "--duration", 2, "--odometry", "none")
+    result = good("map_bag", path, "-o", tmp_path / "map")
+    assert "no odometry" in result.stderr
+
+
+def test_capture_to_bag_to_map(bag, tmp_path):
+    result = good("pcap_to_bag", bag.with_suffix(".pcap"), "-o", tmp_path / "capture.bag")
+    assert " 0 lost" in result.stdout
+    good("map_bag", tmp_path / "capture.bag", "-o", tmp_path / "map")
+
+
+def test_real_capture(tmp_path):
+    capture = SHARED / "vlp16/grap_apple_20frames.pcap"
+    if not capture.exists():
+        pytest.skip(f"{capture} is not here")
+    good("pcap_to_bag", capture, "-o", tmp_path / "grap.bag")
+    result = good("map_bag", tmp_path / "grap.bag", "-o", tmp_path / "map")
+    assert "no odometry" in result.stderr
+
+
+def test_errors_are_one_clear_line(bag, tmp_path):
+    one_line_error(run("map_bag", tmp_path / "none.bag", "-o", tmp_path / "m"), "no such bag")
+    text = tmp_path / "text.bag"
+    text.write_text("this is not a bag\n")
+    one_line_error(run("map_bag", text, "-o", tmp_path / "m"), "text.bag")
+    one_line_error(run("map_bag", bag, "-o", tmp_path / "m", "--points", "/nothing"), "/nothing",
+                   "/velodyne_points (sensor_msgs/PointCloud2")
+    one_line_error(run("map_bag", bag, "-o", tmp_path / "m", "--load", tmp_path / "no_map"), "no_map")
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("cylinder_fitting: {max_radus_m: 0.3}\n")
+    one_line_error(run("map_bag", bag, "-o", tmp_path / "m", "--config", bad), "max_radus_m",
+                   "did you mean 'max_radius_m'")
+    bad.write_text("cylinder_fitting: {max_radius_m: -1.0}\n")
+    one_line_error(run("map_bag", bag, "-o", tmp_path / "m", "--config", bad), "max_radius_m")
+    one_line_error(run("simulate_bag", tmp_path / "no.yaml", PATH, "-o", tmp_path / "x.bag"), "no.yaml")
+    one_line_error(run("simulate_bag", SCENE, PATH, "-o", "/proc/x.bag", "--duration", 1), "/proc/x.bag")
+    one_line_error(run("pcap_to_bag", tmp_path / "no.pcap", "-o", tmp_path / "x.bag"), "no.pcap")
+    one_line_error(run("pcap_to_bag", text, "-o", tmp_path / "x.bag"), "text.bag")
+    assert not (tmp_path / "x.bag").exists()
+    assert not (tmp_path / "m").exists() or not list((tmp_path / "m").iterdir())
+
+
+if __name__ == "__main__":
+    sys.exit(pytest.main([__file__, "-q", "-p", "no:cacheprovider"]))
