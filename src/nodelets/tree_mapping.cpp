@@ -39,7 +39,7 @@ class TreeMapping : public nodelet::Nodelet {
   using Input = std::variant<Cylinders, Odometry, IcpOdometry>;
   struct WaitingScan {
     Cylinders cylinders;
-    std::optional<dendro::RelativeMotion> icp;
+    std::shared_ptr<const dendro::RelativeMotion> icp;  ///< Null: ICP found no motion.
   };
 
   void onInit() override {
@@ -114,14 +114,18 @@ class TreeMapping : public nodelet::Nodelet {
     if (config_.use_icp) {
       join_->AddFirst(ToNs(cylinders->header.stamp), cylinders);
     } else {
-      AddToGate({cylinders, std::nullopt});
+      AddToGate({cylinders, nullptr});
     }
   }
 
   void AddJoined(const Cylinders& cylinders, const std::optional<IcpOdometry>& icp) {
-    WaitingScan scan{cylinders, std::nullopt};
+    WaitingScan scan{cylinders, nullptr};
     if (icp) {
-      if (last_icp_) scan.icp = MotionBetween(*last_icp_, *icp->msg);
+      if (last_icp_) {
+        if (const auto motion = MotionBetween(*last_icp_, *icp->msg)) {
+          scan.icp = std::make_shared<const dendro::RelativeMotion>(*motion);
+        }
+      }
       last_icp_ = icp->msg;
     }
     AddToGate(std::move(scan));
@@ -156,7 +160,7 @@ class TreeMapping : public nodelet::Nodelet {
     dendro::MapperInput input;
     input.stamp_ns = ToNs(header.stamp);
     input.cylinders = FromMsg(*scan.cylinders);
-    input.icp = scan.icp;
+    if (scan.icp) input.icp = *scan.icp;
     std::optional<Eigen::Isometry3d> T_odom_body;
     if (gate_->poses() != nullptr) T_odom_body = gate_->poses()->Lookup(input.stamp_ns);
     if (T_odom_body) input.T_odom_lidar = *T_odom_body * gate_->T_body_lidar();

@@ -68,7 +68,7 @@ class BadInputTest(unittest.TestCase):
         cls.points = rospy.Publisher("/velodyne_points", PointCloud2, queue_size=100)
         cls.odometry = rospy.Publisher("/odometry", Odometry, queue_size=100)
         deadline = time.monotonic() + 60
-        while cls.points.get_num_connections() == 0 or cls.odometry.get_num_connections() < 2:
+        while cls.points.get_num_connections() == 0 or cls.odometry.get_num_connections() == 0:
             assert time.monotonic() < deadline, "the pipeline did not come up"
             time.sleep(0.2)
         time.sleep(2.0)
