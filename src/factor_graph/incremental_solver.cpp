@@ -35,11 +35,24 @@ void Require(bool ok, const char* field, const char* rule) {
   if (!ok) throw std::invalid_argument(std::string("SolverConfig.") + field + " must be " + rule);
 }
 
-// The error is a sum of rounded terms: a rise within this part of it is no rise.
-constexpr double kRounding = 1e-13;
+// The error is a sum of rounded terms: a rise within this part of it, or within a part of a
+// billionth of one measurement's expected error, is no rise.
+constexpr double kRelativeRounding = 1e-13;
+constexpr double kAbsoluteRounding = 1e-12;
 
 // A step that raises the error by less than this factor is shortened before it is damped.
 constexpr double kSmallRise = 1.1;
+
+// A step that raises the error by less than this part of it, and no part of which lowers it, is at
+// the optimum as far as the linearisation can tell: the estimate stays, damping would find nothing.
+constexpr double kNegligibleRise = 1e-4;
+
+// A variable stays where it is when it would move by less than this part of the wildfire threshold.
+constexpr double kStillPart = 0.02;
+
+bool Lowers(double after, double before) {
+  return after <= before * (1.0 + kRelativeRounding) + kAbsoluteRounding;
+}
 
 }  // namespace
 
@@ -446,7 +459,7 @@ void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
       bool moved = false;
       bool publish = false;
       for (int k = 0; k < v.dimension; ++k) {
-        moved = moved || x[k] != v.delta[k];
+        moved = moved || std::abs(x[k] - v.delta[k]) > kStillPart * threshold;
         publish = publish || std::abs(x[k] - v.published[k]) > threshold;
       }
       if (moved) {
@@ -685,7 +698,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       }
       Solve(config_.wildfire_threshold, &step);
       const double error = Error();
-      if (error <= result.error_before * (1.0 + kRounding)) {
+      if (Lowers(error, result.error_before)) {
         result.damping = lambda_;
         lambda_ *= config_.lambda_down;
         if (lambda_ < config_.lambda_min) lambda_ = 0.0;
@@ -702,7 +715,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
           accepted = Error() <= result.error_before;
           if (!accepted) Undo(step);
         }
-        if (accepted) break;
+        if (accepted || error <= (1.0 + kNegligibleRise) * result.error_before) break;
       }
       if (result.iterations >= config_.max_iterations || lambda_ >= config_.lambda_max) break;
       // Once more from the present estimate, linearised there, with more damping.
@@ -789,7 +802,7 @@ UpdateResult IncrementalSolver::Impl::Iterate(double tolerance, int max_iteratio
     result.variables_reeliminated += static_cast<int>(all.size());
     Solve(0.0, &step);
     const double next = Error();
-    if (next <= error * (1.0 + kRounding)) {
+    if (Lowers(next, error)) {
       result.converged = error - next <= tolerance * error;
       result.damping = lambda;
       error = next;
