@@ -31,7 +31,7 @@ import torch.nn.functional as F
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 CLASSES = ["ground", "wood", "leaf", "other"]
-WOOD = 1
+WOOD, OTHER = 1, 3
 PLANES = 8
 MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE = range(PLANES)
 IGNORE = 255
@@ -320,6 +320,7 @@ class Dataset:
         if not self.count:
             raise SystemExit("train_segmentation: no simulated scans")
         self.wood_columns = [np.flatnonzero((y == WOOD).any(0)) for y in self.labels]
+        self.other_columns = [np.flatnonzero((y == OTHER).any(0)) for y in self.labels]
         self.busy_columns = [np.flatnonzero(((y != IGNORE) & (y != 0)).any(0)) for y in self.labels]
 
     def crop(self, index, start, width):
@@ -378,8 +379,10 @@ def batches(data, rng, steps, size, width):
         xs, ys = [], []
         for _ in range(size):
             i = int(rng.integers(data.count))
-            columns = data.wood_columns[i] if rng.random() < 0.75 else data.busy_columns[i]
-            if len(columns) and rng.random() < 0.9:
+            draw = rng.random()
+            columns = (data.wood_columns if draw < 0.5 else
+                       data.other_columns if draw < 0.8 else data.busy_columns)[i]
+            if len(columns) and rng.random() < 0.95:
                 start = int(rng.choice(columns)) - int(rng.integers(width))
             else:
                 start = int(rng.integers(data.cols))

@@ -98,7 +98,7 @@ void AddGrass(Random& rng, Scene* scene) {
   }
 }
 
-void AddObstacles(Random& rng, Scene* scene) {
+void AddObstacles(bool clutter, Random& rng, Scene* scene) {
   const auto add = [&](const Eigen::Vector3d& size, double reach, double least) {
     // Not on top of a trunk.
     for (int attempt = 0; attempt < 20; ++attempt) {
@@ -132,6 +132,15 @@ void AddObstacles(Random& rng, Scene* scene) {
   for (int i = rng.Integer(0, 2); i > 0; --i) {  // Crates and cars.
     add({rng.Uniform(0.6, 4.0), rng.Uniform(0.5, 1.8), rng.Uniform(0.5, 1.8)}, 12.0, 4.0);
   }
+  if (clutter) {
+    for (int i = rng.Integer(1, 3); i > 0; --i) {  // Pillars as thick as trunks, and people.
+      const double side = rng.Uniform(0.25, 0.8);
+      add({side, side * rng.Uniform(0.7, 1.4), rng.Uniform(1.5, 6.0)}, 9.0, 1.0);
+      add({rng.Uniform(0.4, 0.6), rng.Uniform(0.22, 0.35), rng.Uniform(1.5, 1.95)}, 8.0, 1.0);
+    }
+    // Ends of walls near by, which look like stems from one side.
+    add({rng.Uniform(1.5, 6.0), rng.Uniform(0.2, 0.6), rng.Uniform(1.5, 6.0)}, 8.0, 2.0);
+  }
   if (rng.Chance(0.3)) {  // Pillars, clearly thicker than a post.
     const double side = rng.Uniform(0.3, 0.7);
     add({side, side, rng.Uniform(2.0, 5.0)}, 9.0, 3.0);
@@ -144,7 +153,8 @@ void AddObstacles(Random& rng, Scene* scene) {
 }  // namespace
 
 const std::vector<std::string>& TrainingKinds() {
-  static const std::vector<std::string> kinds = {"thesis", "leafless", "leafy", "tilted"};
+  static const std::vector<std::string> kinds = {"thesis", "leafless", "leafy", "tilted",
+                                                 "clutter"};
   return kinds;
 }
 
@@ -156,7 +166,8 @@ Scene RandomTrainingScene(const std::string& kind, std::uint64_t seed) {
   Random rng(seed * 2654435761U + 17U);
   Scene scene;
   std::string trees = kind;
-  if (kind == "tilted") trees = rng.Chance(0.5) ? "leafy" : rng.Chance(0.5) ? "leafless" : "thesis";
+  const bool clutter = kind == "clutter";
+  if (kind == "tilted" || clutter) trees = rng.Chance(0.5) ? "leafy" : rng.Chance(0.5) ? "leafless" : "thesis";
   if (trees == "thesis" || rng.Chance(0.25)) {
     scene.ground.type = SceneGround::Type::kPlane;
   } else if (rng.Chance(0.05)) {
@@ -178,9 +189,9 @@ Scene RandomTrainingScene(const std::string& kind, std::uint64_t seed) {
     AddTrees(trees, rng, &scene);
   }
   if (trees == "thesis") {
-    if (rng.Chance(0.3)) AddObstacles(rng, &scene);
+    if (clutter || rng.Chance(0.3)) AddObstacles(clutter, rng, &scene);
   } else {
-    AddObstacles(rng, &scene);
+    AddObstacles(clutter, rng, &scene);
     if (scene.ground.type != SceneGround::Type::kNone && rng.Chance(0.4)) AddGrass(rng, &scene);
   }
   SceneReflectivity& r = scene.reflectivity;

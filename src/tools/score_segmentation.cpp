@@ -32,7 +32,7 @@ struct Options {
   std::uint64_t seed = 5000000;
   std::string methods = "network,geometric";
   std::string weights;
-  std::string kinds = "thesis,leafless,leafy,tilted";
+  std::string kinds = "thesis,leafless,leafy,tilted,clutter";
   int sub_rays_width = 8;
   int sub_rays_height = 3;
   dendro::ProjectorConfig projector;

@@ -31,7 +31,8 @@ struct Options {
   std::uint64_t seed = 1000;
   int sub_rays_width = 5;
   int sub_rays_height = 2;
-  std::string kinds = "thesis,thesis,leafless,leafless,leafless,leafy,leafy,leafy,leafy,tilted";
+  std::string kinds =
+      "thesis,clutter,leafless,leafy,thesis,leafy,clutter,leafless,leafy,tilted,leafless,leafy";
   dendro::ProjectorConfig projector;
 };
 
@@ -110,7 +111,7 @@ int main(int argc, char** argv) {
   app.add_option("--seed", options.seed, "Of the first scene; the next ones count up");
   app.add_option("--sub-rays-width", options.sub_rays_width)->check(CLI::Range(1, 64));
   app.add_option("--sub-rays-height", options.sub_rays_height)->check(CLI::Range(1, 64));
-  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted)");
+  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted, clutter)");
   app.add_option("--model", options.projector.model, "vlp16 or uniform");
   app.add_option("--rows", options.projector.rows);
   app.add_option("--cols", options.projector.cols);

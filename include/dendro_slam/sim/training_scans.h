@@ -24,6 +24,7 @@ struct TrainingScan {
 ///   leafless  bare trees of all forms, rough ground, rocks, grass, walls, crates, pillars, people
 ///   leafy     the same, in leaf
 ///   tilted    any of these, the sensor mounted at a random angle, up to lying on its side
+///   clutter   any of the first three among pillars as thick as trunks, people and ends of walls
 const std::vector<std::string>& TrainingKinds();
 
 /// A random scene of a kind, a deterministic function of the seed. Reflectivities are drawn at

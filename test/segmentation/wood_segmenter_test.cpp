@@ -1,0 +1,238 @@
+#include "dendro_slam/segmentation/wood_segmenter.h"
+
+#include <cmath>
+#include <limits>
+#include <string>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+#include "dendro_slam/segmentation/safetensors.h"
+#include "dendro_slam/sim/training_scans.h"
+#include "synthetic_scan.h"
+
+namespace dendro {
+namespace {
+
+LidarSimulatorConfig Lidar() {
+  LidarSimulatorConfig lidar;
+  lidar.sub_rays_width = 5;
+  lidar.sub_rays_height = 2;
+  return lidar;
+}
+
+struct Scores {
+  double wood_iou, accuracy, recall;
+};
+
+// Scores over scans of scenes whose seeds were never trained on (training uses seeds below 900000,
+// its held-out set 900000 to 901000).
+Scores ScoreOn(WoodSegmenter& segmenter,
+               const std::string& kind,
+               int scenes,
+               int scans_per_scene,
+               const ProjectorConfig& projector = ProjectorConfig()) {
+  std::vector<Label> labels;
+  std::vector<Label> truth;
+  for (int scene = 0; scene < scenes; ++scene) {
+    for (TrainingScan& scan : SimulateTrainingScans(
+             kind, 7000000U + static_cast<unsigned>(scene), scans_per_scene, Lidar(), projector)) {
+      const LabelledScan result = segmenter.Segment(std::move(scan.image));
+      labels.insert(labels.end(), result.label.begin(), result.label.end());
+      truth.insert(truth.end(), scan.truth.begin(), scan.truth.end());
+    }
+  }
+  double both = 0, wood = 0;
+  for (std::size_t i = 0; i < truth.size(); ++i) {
+    wood += truth[i] == Label::kWood;
+    both += truth[i] == Label::kWood && labels[i] == Label::kWood;
+  }
+  EXPECT_GT(wood, 500.0) << kind;
+  return {test::WoodIou(labels, truth), test::Accuracy(labels, truth), both / wood};
+}
+
+TEST(WoodSegmenterNetwork, ThesisScenes) {
+  WoodSegmenter segmenter{WoodSegmenterConfig()};
+  const Scores scores = ScoreOn(segmenter, "thesis", 4, 2);
+  EXPECT_GT(scores.wood_iou, 0.96);
+  EXPECT_GT(scores.accuracy, 0.99);
+  EXPECT_GT(scores.recall, 0.97);
+}
+
+TEST(WoodSegmenterNetwork, LeaflessScenes) {
+  WoodSegmenter segmenter{WoodSegmenterConfig()};
+  const Scores scores = ScoreOn(segmenter, "leafless", 4, 2);
+  EXPECT_GT(scores.wood_iou, 0.90);
+  EXPECT_GT(scores.accuracy, 0.98);
+}
+
+TEST(WoodSegmenterNetwork, ScenesInLeafBeatTheGeometricFallback) {
+  WoodSegmenter segmenter{WoodSegmenterConfig()};
+  WoodSegmenterConfig fallback;
+  fallback.method = "geometric";
+  WoodSegmenter geometric(fallback);
+  const Scores scores = ScoreOn(segmenter, "leafy", 4, 2);
+  EXPECT_GT(scores.wood_iou, 0.75);
+  EXPECT_GT(scores.wood_iou, ScoreOn(geometric, "leafy", 4, 2).wood_iou);
+}
+
+TEST(WoodSegmenterGeometric, ThesisScenes) {
+  WoodSegmenterConfig config;
+  config.method = "geometric";
+  WoodSegmenter segmenter(config);
+  const Scores scores = ScoreOn(segmenter, "thesis", 4, 2);
+  EXPECT_GT(scores.wood_iou, 0.80);
+  EXPECT_GT(scores.recall, 0.90);
+}
+
+TEST(WoodSegmenterNetwork, RollingTheScanRollsTheLabels) {
+  WoodSegmenter segmenter{WoodSegmenterConfig()};
+  const TrainingScan scan =
+      SimulateTrainingScans("leafy", 7100000U, 1, Lidar(), ProjectorConfig()).front();
+  const LabelledScan straight = segmenter.Segment(scan.image);
+  // Not a multiple of the network's stride, and it brings a tree across azimuth 0.
+  for (const int k : {333, 905, 1799}) {
+    const LabelledScan rolled = segmenter.Segment(test::Rolled(scan.image, k));
+    std::size_t different = 0;
+    std::size_t returns = 0;
+    for (int r = 0; r < rolled.image.rows; ++r) {
+      for (int c = 0; c < rolled.image.cols; ++c) {
+        const std::size_t i = rolled.image.Index(r, c);
+        if (!rolled.image.HasReturn(i)) continue;
+        ++returns;
+        const std::size_t j = rolled.image.Index(r, rolled.image.WrapColumn(c + k));
+        different += rolled.label[i] != straight.label[j];
+      }
+    }
+    EXPECT_LT(static_cast<double>(different), 0.01 * static_cast<double>(returns)) << k;
+  }
+}
+
+TEST(WoodSegmenterNetwork, SameInputSameBytesAlsoWithTwoThreads) {
+  const TrainingScan scan =
+      SimulateTrainingScans("leafless", 7200000U, 1, Lidar(), ProjectorConfig()).front();
+  WoodSegmenterConfig config;
+  WoodSegmenter one(config);
+  config.num_threads = 2;
+  WoodSegmenter two(config);
+  const LabelledScan a = one.Segment(scan.image);
+  const LabelledScan b = two.Segment(scan.image);
+  const LabelledScan c = one.Segment(scan.image);
+  EXPECT_EQ(a.label, b.label);
+  EXPECT_EQ(a.wood_probability, c.wood_probability);
+  EXPECT_EQ(a.wood_probability, b.wood_probability);
+}
+
+TEST(WoodSegmenterNetwork, SectorsGiveWhatTheWholeImageGives) {
+  const TrainingScan scan =
+      SimulateTrainingScans("leafless", 7300000U, 1, Lidar(), ProjectorConfig()).front();
+  WoodSegmenterConfig config;
+  WoodSegmenter sectors(config);
+  config.skip_bare_ground = false;
+  config.margin_columns = 900;
+  WoodSegmenter whole(config);
+  const LabelledScan a = sectors.Segment(scan.image);
+  const LabelledScan b = whole.Segment(scan.image);
+  std::size_t returns = 0;
+  std::size_t different = 0;
+  for (std::size_t i = 0; i < a.label.size(); ++i) {
+    if (!scan.image.HasReturn(i)) continue;
+    ++returns;
+    different += (a.label[i] == Label::kWood) != (b.label[i] == Label::kWood);
+  }
+  EXPECT_LT(static_cast<double>(different), 0.005 * static_cast<double>(returns));
+}
+
+class BothMethods : public ::testing::TestWithParam<std::string> {
+ protected:
+  WoodSegmenter Make() const {
+    WoodSegmenterConfig config;
+    config.method = GetParam();
+    return WoodSegmenter(config);
+  }
+};
+INSTANTIATE_TEST_SUITE_P(Methods, BothMethods, ::testing::Values("network", "geometric"));
+
+TEST_P(BothMethods, ImageWithoutReturns) {
+  WoodSegmenter segmenter = Make();
+  const LabelledScan result = segmenter.Segment(test::EmptyImage(16, 1800));
+  ASSERT_EQ(result.label.size(), 28800U);
+  for (std::size_t i = 0; i < result.label.size(); ++i) {
+    ASSERT_EQ(result.label[i], Label::kNone);
+    ASSERT_EQ(result.wood_probability[i], 0.0F);
+  }
+}
+
+TEST_P(BothMethods, ImageWithoutPixels) {
+  WoodSegmenter segmenter = Make();
+  EXPECT_TRUE(segmenter.Segment(RangeImage()).label.empty());
+}
+
+TEST_P(BothMethods, LabelsOnlyReturnsAndMovesTheImage) {
+  WoodSegmenter segmenter = Make();
+  test::SyntheticScan scan =
+      test::MakeScan({{4.0, 0.2, 0.15, 6.0}, {-3.0, 5.0, 0.10, 5.0}}, 1.7, 0.01, 11);
+  const Eigen::Vector3f* memory = scan.image.point.data();
+  const LabelledScan result = segmenter.Segment(std::move(scan.image));
+  EXPECT_EQ(result.image.point.data(), memory);
+  for (std::size_t i = 0; i < result.label.size(); ++i) {
+    ASSERT_EQ(result.label[i] == Label::kNone, !result.image.HasReturn(i));
+    ASSERT_GE(result.wood_probability[i], 0.0F);
+    ASSERT_LE(result.wood_probability[i], 1.0F);
+  }
+  EXPECT_GT(test::WoodIou(result.label, scan.truth), 0.9);
+}
+
+TEST_P(BothMethods, OtherSizesOfImage) {
+  WoodSegmenter segmenter = Make();
+  for (const auto& [rows, cols] : std::vector<std::pair<int, int>>{{32, 360}, {15, 901}, {1, 8}}) {
+    const test::SyntheticScan scan = test::MakeScan({{4.0, 0.2, 0.15, 6.0}}, 1.7, 0.01, 11,
+                                                    Eigen::Matrix3d::Identity(), rows, cols);
+    EXPECT_EQ(segmenter.Segment(scan.image).label.size(), static_cast<std::size_t>(rows * cols));
+  }
+}
+
+TEST_P(BothMethods, RefusesAnImageThatContradictsItself) {
+  WoodSegmenter segmenter = Make();
+  RangeImage image = test::EmptyImage(16, 1800);
+  image.range.pop_back();
+  EXPECT_THROW(segmenter.Segment(std::move(image)), std::invalid_argument);
+}
+
+TEST(WoodSegmenter, RefusesBadConfigurationNamingTheField) {
+  const auto expect = [](const WoodSegmenterConfig& config, const std::string& field) {
+    try {
+      WoodSegmenter segmenter(config);
+      ADD_FAILURE() << field;
+    } catch (const std::invalid_argument& error) {
+      EXPECT_NE(std::string(error.what()).find(field), std::string::npos) << error.what();
+    }
+  };
+  WoodSegmenterConfig config;
+  config.method = "magic";
+  expect(config, "method");
+  config = {};
+  config.max_range_m = std::numeric_limits<double>::quiet_NaN();
+  expect(config, "max_range_m");
+  config = {};
+  config.wood_threshold = 1.5;
+  expect(config, "wood_threshold");
+  config = {};
+  config.num_threads = 0;
+  expect(config, "num_threads");
+  config = {};
+  config.ground.inlier_distance_m = -1.0;
+  expect(config, "inlier_distance_m");
+}
+
+TEST(WoodSegmenter, RefusesWeightsOfAnotherNetwork) {
+  WoodSegmenterConfig config;
+  config.weights = "/nonexistent.safetensors";
+  EXPECT_THROW(WoodSegmenter{config}, WeightsError);
+  config.weights =
+      std::string(DENDRO_SOURCE_DIR) + "/test/segmentation/data/erfnet_fixture_io.safetensors";
+  EXPECT_THROW(WoodSegmenter{config}, WeightsError);
+}
+
+}  // namespace
+}  // namespace dendro
