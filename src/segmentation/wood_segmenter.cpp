@@ -130,7 +130,8 @@ struct WoodSegmenter::Impl {
         writes->push_back(1);
       }
     }
-    while (source->size() % kWidthStep != 0 ||
+    const std::size_t step = all ? 1 : kWidthStep;
+    while (source->size() % step != 0 ||
            source->size() % static_cast<std::size_t>(net->col_multiple()) != 0) {
       source->push_back(-1);
       writes->push_back(0);

@@ -20,6 +20,8 @@
 #include <nlohmann/json.hpp>
 
 #include "dendro_slam/segmentation/wood_segmenter.h"
+#include "dendro_slam/sensors/deskew.h"
+#include "dendro_slam/sim/flight_path.h"
 #include "dendro_slam/sim/training_scans.h"
 
 namespace {
@@ -32,6 +34,9 @@ struct Options {
   std::uint64_t seed = 5000000;
   std::string methods = "network,geometric";
   std::string weights;
+  std::string scene;  ///< Scene file; with `path` instead of random scenes.
+  std::string path;
+  int every = 10;     ///< Of the flight's scans.
   std::string kinds = "thesis,leafless,leafy,tilted,clutter";
   int sub_rays_width = 8;
   int sub_rays_height = 3;
@@ -98,8 +103,66 @@ struct Score {
   }
 };
 
+using Segmenters = std::vector<std::pair<std::string, dendro::WoodSegmenter>>;
+using Scores = std::map<std::string, std::map<std::string, Score>>;  // By method, then kind.
+
+void ScoreScan(const dendro::TrainingScan& scan, Segmenters* segmenters, Scores* scores) {
+  for (auto& [method, segmenter] : *segmenters) {
+    dendro::RangeImage image = scan.image;
+    const auto start = std::chrono::steady_clock::now();
+    const dendro::LabelledScan result = segmenter.Segment(std::move(image));
+    const std::chrono::duration<double, std::milli> time =
+        std::chrono::steady_clock::now() - start;
+    Score& score = (*scores)[method][scan.kind];
+    score.milliseconds.push_back(time.count());
+    for (std::size_t i = 0; i < scan.truth.size(); ++i) {
+      if (scan.truth[i] == Label::kNone) continue;
+      score.all.Add(result.label[i], scan.truth[i]);
+      score.confusion[static_cast<std::size_t>(scan.truth[i])]
+                     [static_cast<std::size_t>(result.label[i])] += 1;
+      for (std::size_t k = 0; k < score.by_range.size(); ++k) {
+        const float range = result.image.range[i];
+        if (range >= kRangeEdges[k] && range < kRangeEdges[k + 1]) {
+          score.by_range[k].Add(result.label[i], scan.truth[i]);
+        }
+      }
+    }
+  }
+}
+
+// Every n-th scan of a flight, deskewed with the true motion.
+void ScoreFlight(const Options& options,
+                 const dendro::LidarSimulatorConfig& lidar,
+                 Segmenters* segmenters,
+                 Scores* scores) {
+  const dendro::Scene scene = dendro::LoadScene(options.scene);
+  const dendro::FlightPath path = dendro::LoadFlightPath(options.path);
+  const dendro::Raycaster raycaster(scene);
+  const dendro::LidarSimulator simulator(raycaster, lidar, path.start_stamp_ns);
+  dendro::Projector projector(options.projector);
+  const auto slash = options.scene.find_last_of('/');
+  const std::string name =
+      slash == std::string::npos ? options.scene : options.scene.substr(slash + 1);
+  const auto pose = [&path](std::int64_t stamp) { return path.LidarPose(stamp); };
+  for (int i = 0; i < simulator.NumScans(path.duration_s); i += options.every) {
+    const dendro::SimulatedScan simulated = simulator.SimulateScan(i, pose);
+    constexpr double kStep = 1e-3;
+    std::vector<Eigen::Isometry3d> T_stamp_t;
+    for (int k = -10; k <= 220; ++k) {
+      const auto t = simulated.scan.stamp_ns + static_cast<std::int64_t>(k * kStep * 1e9);
+      T_stamp_t.push_back(pose(simulated.scan.stamp_ns).inverse() * pose(t));
+    }
+    const dendro::SweepMotion motion(T_stamp_t, -10 * kStep, kStep);
+    dendro::TrainingScan scan;
+    scan.image = projector.Project(simulated.scan, &motion);
+    scan.truth = dendro::PixelTruth(scan.image, simulated.truth);
+    scan.kind = name;
+    ScoreScan(scan, segmenters, scores);
+  }
+}
+
 void Run(const Options& options) {
-  std::vector<std::pair<std::string, dendro::WoodSegmenter>> segmenters;
+  Segmenters segmenters;
   for (const std::string& method : Split(options.methods)) {
     dendro::WoodSegmenterConfig config;
     config.method = method;
@@ -110,42 +173,27 @@ void Run(const Options& options) {
   lidar.sub_rays_width = options.sub_rays_width;
   lidar.sub_rays_height = options.sub_rays_height;
   const bool progress = isatty(STDERR_FILENO) != 0;
-  std::map<std::string, std::map<std::string, Score>> scores;
-  for (const std::string& kind : Split(options.kinds)) {
-    int done = 0;
-    for (std::uint64_t scene = 0; done < options.scans_per_kind; ++scene) {
-      const int count = std::min(options.scans_per_scene, options.scans_per_kind - done);
-      for (const dendro::TrainingScan& scan : dendro::SimulateTrainingScans(
-               kind, options.seed + scene, count, lidar, options.projector)) {
-        for (auto& [method, segmenter] : segmenters) {
-          dendro::RangeImage image = scan.image;
-          const auto start = std::chrono::steady_clock::now();
-          const dendro::LabelledScan result = segmenter.Segment(std::move(image));
-          const std::chrono::duration<double, std::milli> time =
-              std::chrono::steady_clock::now() - start;
-          Score& score = scores[method][kind];
-          score.milliseconds.push_back(time.count());
-          for (std::size_t i = 0; i < scan.truth.size(); ++i) {
-            if (scan.truth[i] == Label::kNone) continue;
-            score.all.Add(result.label[i], scan.truth[i]);
-            score.confusion[static_cast<std::size_t>(scan.truth[i])]
-                           [static_cast<std::size_t>(result.label[i])] += 1;
-            for (std::size_t k = 0; k < score.by_range.size(); ++k) {
-              const float range = result.image.range[i];
-              if (range >= kRangeEdges[k] && range < kRangeEdges[k + 1]) {
-                score.by_range[k].Add(result.label[i], scan.truth[i]);
-              }
-            }
-          }
+  Scores scores;
+  if (!options.scene.empty()) {
+    ScoreFlight(options, lidar, &segmenters, &scores);
+  } else {
+    for (const std::string& kind : Split(options.kinds)) {
+      int done = 0;
+      for (std::uint64_t scene = 0; done < options.scans_per_kind; ++scene) {
+        const int count = std::min(options.scans_per_scene, options.scans_per_kind - done);
+        for (const dendro::TrainingScan& scan : dendro::SimulateTrainingScans(
+                 kind, options.seed + scene, count, lidar, options.projector)) {
+          ScoreScan(scan, &segmenters, &scores);
+          ++done;
         }
-        ++done;
-      }
-      if (progress) {
-        std::fprintf(stderr, "\r%-10s %d of %d scans", kind.c_str(), done, options.scans_per_kind);
+        if (progress) {
+          std::fprintf(
+              stderr, "\r%-10s %d of %d scans", kind.c_str(), done, options.scans_per_kind);
+        }
       }
     }
+    if (progress) std::fprintf(stderr, "\n");
   }
-  if (progress) std::fprintf(stderr, "\n");
   nlohmann::json json;
   for (auto& [method, kinds] : scores) {
     for (auto& [kind, score] : kinds) json[method][kind] = score.Json();
@@ -164,6 +212,12 @@ int main(int argc, char** argv) {
   app.add_option("--methods", options.methods, "network, geometric or both, with a comma");
   app.add_option("--weights", options.weights, "Weights file; default: the shipped one");
   app.add_option("--kinds", options.kinds);
+  auto* scene = app.add_option("--scene", options.scene, "Scene file, instead of random scenes");
+  auto* path = app.add_option("--path", options.path, "Flight through the scene");
+  scene->needs(path);
+  path->needs(scene);
+  app.add_option("--every", options.every, "Scores every n-th scan of the flight")
+      ->check(CLI::Range(1, 100000));
   app.add_option("--sub-rays-width", options.sub_rays_width)->check(CLI::Range(1, 64));
   app.add_option("--sub-rays-height", options.sub_rays_height)->check(CLI::Range(1, 64));
   app.add_option("--model", options.projector.model, "vlp16 or uniform");

@@ -71,9 +71,9 @@ TEST(WoodSegmenterNetwork, ScenesInLeafBeatTheGeometricFallback) {
   WoodSegmenterConfig fallback;
   fallback.method = "geometric";
   WoodSegmenter geometric(fallback);
-  const Scores scores = ScoreOn(segmenter, "leafy", 4, 2);
-  EXPECT_GT(scores.wood_iou, 0.75);
-  EXPECT_GT(scores.wood_iou, ScoreOn(geometric, "leafy", 4, 2).wood_iou);
+  const Scores scores = ScoreOn(segmenter, "leafy", 8, 1);
+  EXPECT_GT(scores.wood_iou, 0.6);
+  EXPECT_GT(scores.wood_iou, ScoreOn(geometric, "leafy", 8, 1).wood_iou + 0.1);
 }
 
 TEST(WoodSegmenterGeometric, ThesisScenes) {
