@@ -12,23 +12,24 @@ namespace {
 
 constexpr double kThinRay = 1e-6;
 
-// Gauss-Legendre on [-1, 1], 8 nodes.
-constexpr std::array<double, 8> kNode = {-0.9602898564975363, -0.7966664774136267,
-                                         -0.5255324099163290, -0.1834346424956498,
-                                         0.1834346424956498,  0.5255324099163290,
-                                         0.7966664774136267,  0.9602898564975363};
-constexpr std::array<double, 8> kWeight = {0.1012285362903763, 0.2223810344533745,
-                                           0.3137066458778873, 0.3626837833783620,
-                                           0.3626837833783620, 0.3137066458778873,
-                                           0.2223810344533745, 0.1012285362903763};
+// Gauss-Legendre on [-1, 1], 6 nodes.
+constexpr std::array<double, 6> kNode = {-0.9324695142031521, -0.6612093864662645,
+                                         -0.2386191860831969, 0.2386191860831969,
+                                         0.6612093864662645,  0.9324695142031521};
+constexpr std::array<double, 6> kWeight = {0.1713244923791704, 0.3607615730481386,
+                                           0.4679139345726910, 0.4679139345726910,
+                                           0.3607615730481386, 0.1713244923791704};
+// A short side below this share of the long one does not change the profile.
+constexpr double kRectangle = 0.03;
 
 // Energy density of the projected rectangle, not normalised (1 at the centre).
 double Density(double u, const Footprint& footprint) {
-  const double inner = footprint.half_width_m - footprint.half_slope_m;
   const double distance = std::abs(u);
-  if (distance <= inner) return 1.0;
-  const double fall = 2.0 * footprint.half_slope_m;
-  return fall > 0.0 ? std::max(0.0, (footprint.reach() - distance) / fall) : 0.0;
+  if (footprint.half_slope_m <= kRectangle * footprint.half_width_m) {
+    return distance <= footprint.half_width_m * (1.0 + 1e-9) ? 1.0 : 0.0;
+  }
+  if (distance <= footprint.half_width_m - footprint.half_slope_m) return 1.0;
+  return std::max(0.0, (footprint.reach() - distance) / (2.0 * footprint.half_slope_m));
 }
 
 // Integrals over the part of the footprint within the silhouette; y' = y + u is a ray's offset and
@@ -59,25 +60,37 @@ LimbIntegrals Integrate(double y, double Y, const Footprint& footprint) {
     sum.shift_y -= w * u * y_ray;
     sum.shift_Y += w * u * Y;
   };
-  if (std::abs(y) + reach < 0.9 * Y) {
-    for (std::size_t i = 0; i < kNode.size(); ++i) {
-      const double y_ray = y + reach * kNode[i];
-      const double g = std::sqrt(Y * Y - y_ray * y_ray);
-      add(y_ray, g, reach * kWeight[i] / g);
+  // The profile has corners at the ends of its flat part: integrate the pieces apart.
+  const double inner = footprint.half_width_m - footprint.half_slope_m;
+  const bool corners = footprint.half_slope_m > kRectangle * footprint.half_width_m;
+  const double ends[4] = {-reach, -inner, inner, reach};
+  const int pieces = corners ? 3 : 1;
+  for (int piece = 0; piece < pieces; ++piece) {
+    const double from = corners ? ends[piece] : -footprint.half_width_m;
+    const double to = corners ? ends[piece + 1] : footprint.half_width_m;
+    if (!(to - from > 1e-3 * reach)) continue;
+    if (std::abs(y) + reach < 0.9 * Y) {
+      const double half = 0.5 * (to - from);
+      const double middle = y + 0.5 * (to + from);
+      for (std::size_t i = 0; i < kNode.size(); ++i) {
+        const double y_ray = middle + half * kNode[i];
+        const double g = std::sqrt(Y * Y - y_ray * y_ray);
+        add(y_ray, g, half * kWeight[i] / g);
+      }
+      continue;
     }
-    return sum;
-  }
-  const double low = std::max(-1.0, (y - reach) / Y);
-  const double high = std::min(1.0, (y + reach) / Y);
-  if (low >= high) return sum;
-  // y' = Y sin(theta) takes the square-root singularity of the limb out of the integrals.
-  const double theta_low = std::asin(low);
-  const double theta_high = std::asin(high);
-  const double half = 0.5 * (theta_high - theta_low);
-  const double middle = 0.5 * (theta_high + theta_low);
-  for (std::size_t i = 0; i < kNode.size(); ++i) {
-    const double sine = std::sin(middle + half * kNode[i]);
-    add(Y * sine, Y * std::sqrt(std::max(0.0, 1.0 - sine * sine)), half * kWeight[i]);
+    const double low = std::max(-1.0, (y + from) / Y);
+    const double high = std::min(1.0, (y + to) / Y);
+    if (low >= high) continue;
+    // y' = Y sin(theta) takes the square-root singularity of the limb out of the integrals.
+    const double theta_low = std::asin(low);
+    const double theta_high = std::asin(high);
+    const double half = 0.5 * (theta_high - theta_low);
+    const double middle = 0.5 * (theta_high + theta_low);
+    for (std::size_t i = 0; i < kNode.size(); ++i) {
+      const double sine = std::sin(middle + half * kNode[i]);
+      add(Y * sine, Y * std::sqrt(std::max(0.0, 1.0 - sine * sine)), half * kWeight[i]);
+    }
   }
   return sum;
 }
@@ -197,7 +210,7 @@ RangePrediction PredictRange(const BeamOnCone& beam, const Footprint& footprint)
   if (footprint.reach() < kThinRay) {
     if (std::abs(y) < Y) {
       depth = std::sqrt(Y * Y - y * y);
-      const double inverse = 1.0 / std::max(depth, 1e-3 * Y);
+      const double inverse = 1.0 / std::max(depth, 0.1 * Y);
       depth_y = -y * inverse;
       depth_Y = Y * inverse;
       out.energy = beam.sin_angle * depth / Y;

@@ -17,7 +17,11 @@ namespace dendro {
 namespace {
 
 constexpr double kDegree = 0.017453292519943295;
-constexpr int kMaxIterations = 15;
+constexpr int kMaxIterations = 25;
+// Iterations whose scale is the median's; then it is the weighted mean's and the anchor stays.
+constexpr int kSettling = 3;
+// Squared length of the last step in standard deviations.
+constexpr double kConverged = 1e-3;
 
 // The state of the final estimator: the cone's tangent space and the error common to all edges.
 constexpr int kStates = 7;
@@ -77,9 +81,19 @@ Posterior Propagate(const Matrix7d& information,
   out.mean = out.covariance * vector;
   if (intervals->empty()) return out;
   const double noise = sigma * sigma;
-  for (Interval& i : *intervals) i.precision = i.shift = 0.0;
+  // Start with every bracket believed, as a uniform error within it; a thin branch's ranges alone
+  // may lie so far off that each bracket by itself would look false.
   Matrix7d precision = information;
   Vector7d natural = vector;
+  for (Interval& i : *intervals) {
+    const double half = 0.5 * (i.high - i.low);
+    i.precision = 1.0 / (half * half / 3.0 + noise);
+    i.shift = i.precision * 0.5 * (i.high + i.low);
+    precision += i.precision * i.g * i.g.transpose();
+    natural += i.shift * i.g;
+  }
+  out.covariance = precision.ldlt().solve(Matrix7d::Identity());
+  out.mean = out.covariance * natural;
   for (int sweep = 0; sweep < 12; ++sweep) {
     double change = 0.0;
     for (Interval& i : *intervals) {
@@ -544,24 +558,28 @@ Estimate SegmentFit::Refine(const Cone& start) const {
   Vector7d vector;
   std::vector<Interval> intervals;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
-    Linearise(&estimate, iteration < 5, &information, &vector, &intervals);
+    Linearise(&estimate, iteration < kSettling, &information, &vector, &intervals);
     const Posterior posterior =
         Propagate(information, vector, config_.edge_sigma_m, kOutlier, &intervals);
-    if (!posterior.mean.allFinite()) return estimate;
+    if (!posterior.mean.allFinite() || !posterior.covariance.allFinite()) return estimate;
     estimate.covariance = posterior.covariance;
-    if (estimate.converged) break;
     Vector7d step = posterior.mean;
-    double shrink = 1.0;
+    const double statistical = step.dot(posterior.covariance.ldlt().solve(step));
+    // Returns at the very limb enter and leave: shorter steps end such a cycle.
+    double shrink = iteration < 2 * kSettling ? 1.0 : 0.5;
     shrink = std::min(shrink, 0.3 / std::max(1e-12, step.head<2>().norm()));
     shrink = std::min(shrink, 0.3 / std::max(1e-12, step.segment<2>(2).norm()));
     shrink = std::min(shrink, 0.4 * estimate.cone.radius / std::max(1e-12, std::abs(step[kRadius])));
     step *= shrink;
     estimate.cone = estimate.cone.Retract(step.head<6>());
     estimate.edge_bias += step[kEdgeBias];
-    Recentre(&estimate.cone, estimate.weights);
-    // One more linearisation after the last step: the covariance belongs to the result.
-    estimate.converged = iteration >= 3 && shrink == 1.0 && step.head<2>().norm() < 3e-4 &&
-                         step.segment<3>(2).norm() < 5e-5;
+    if (iteration < kSettling) Recentre(&estimate.cone, estimate.weights);
+    if (iteration >= kSettling && statistical < kConverged) {
+      estimate.converged = true;
+      break;
+    }
+    // A remaining cycle well inside the estimate's own sigma does not matter.
+    if (iteration == kMaxIterations - 1) estimate.converged = statistical < 1.0;
   }
   return estimate;
 }
