@@ -32,13 +32,24 @@ double Density(double u, const Footprint& footprint) {
   return std::max(0.0, (footprint.reach() - distance) / (2.0 * footprint.half_slope_m));
 }
 
+// Share of the projected rectangle below u.
+double ShareBelow(double u, const Footprint& footprint) {
+  const double w = footprint.half_width_m, h = footprint.half_slope_m;
+  if (h <= kRectangle * w) return std::clamp(0.5 + 0.5 * u / w, 0.0, 1.0);
+  const double distance = std::abs(u);
+  if (distance >= w + h) return u > 0.0 ? 1.0 : 0.0;
+  const double beyond = distance <= w - h
+                            ? 0.5 - 0.5 * distance / w
+                            : (w + h - distance) * (w + h - distance) / (8.0 * w * h);
+  return u > 0.0 ? 1.0 - beyond : beyond;
+}
+
 // Integrals over the part of the footprint within the silhouette; y' = y + u is a ray's offset and
 // g = sqrt(Y^2 - y'^2) both its depth and, over Y, its cosine of incidence.
 struct LimbIntegrals {
   double energy = 0.0, energy_y = 0.0, energy_Y = 0.0;  // of w g
   double depth = 0.0, depth_y = 0.0, depth_Y = 0.0;     // of w g^2
   double shift = 0.0, shift_y = 0.0, shift_Y = 0.0;     // of w g u
-  double share = 0.0;                                   // of w
 };
 
 LimbIntegrals Integrate(double y, double Y, const Footprint& footprint) {
@@ -49,7 +60,6 @@ LimbIntegrals Integrate(double y, double Y, const Footprint& footprint) {
     const double u = y_ray - y;
     const double w = Density(u, footprint) * slice;
     const double wg = w * g;
-    sum.share += wg;
     sum.energy += wg * g;
     sum.energy_y -= w * y_ray;
     sum.energy_Y += w * Y;
@@ -239,45 +249,51 @@ RangePrediction PredictRange(const BeamOnCone& beam, const Footprint& footprint)
 double DetectionOffset(double silhouette,
                        double sin_angle,
                        const Footprint& footprint,
-                       double energy,
+                       double share,
                        double competing,
                        double* d_silhouette) {
   const double Y = silhouette;
   if (d_silhouette != nullptr) *d_silhouette = 1.0;
   if (footprint.reach() < kThinRay) return Y;
   const double area = 2.0 * footprint.half_width_m;
-  const double scale = sin_angle / (Y * area);
-  // What a beam at an offset gets from the cone less what it needs, and whether the surface behind
-  // sets that need.
-  const auto excess = [&](const LimbIntegrals& sum, bool* behind) {
-    const double rest = competing * (1.0 - sum.share / area);
-    *behind = rest > energy;
-    return scale * sum.energy - std::max(energy, rest);
+  const auto met = [&](double e) { return ShareBelow(Y - e, footprint) - ShareBelow(-Y - e, footprint); };
+  // Both conditions fall with the offset; the smaller root is the answer.
+  const auto root = [&](auto excess, auto slope) {
+    double low = 0.0;
+    double high = Y + footprint.reach();
+    double e = Y;
+    if (excess(0.0) <= 0.0) return 0.0;
+    for (int i = 0; i < 60; ++i) {
+      const double value = excess(e);
+      (value > 0.0 ? low : high) = e;
+      const double s = slope(e);
+      double next = s < 0.0 ? e - value / s : low;
+      if (!(next > low && next < high)) next = 0.5 * (low + high);
+      const bool done = std::abs(next - e) < 1e-8;
+      e = next;
+      if (done) break;
+    }
+    return e;
   };
-  bool behind = false;
-  LimbIntegrals sum = Integrate(0.0, Y, footprint);
-  if (excess(sum, &behind) <= 0.0) {
-    if (d_silhouette != nullptr) *d_silhouette = 0.0;
-    return 0.0;
+  const auto density = [&](double e) { return Density(Y - e, footprint) - Density(Y + e, footprint); };
+  double e = root([&](double x) { return met(x) - share; },
+                  [&](double x) { return -density(x) / area; });
+  if (competing > 0.0) {
+    const double scale = sin_angle / (Y * area);
+    const double visible =
+        root([&](double x) { return scale * Integrate(x, Y, footprint).energy - competing * (1.0 - met(x)); },
+             [&](double x) {
+               return scale * Integrate(x, Y, footprint).energy_y - competing * density(x) / area;
+             });
+    if (visible < e) {
+      if (d_silhouette != nullptr) *d_silhouette = visible > 0.0 ? 1.0 : 0.0;
+      return visible;
+    }
   }
-  // Newton within a shrinking bracket: the excess falls with the offset.
-  double low = 0.0;
-  double high = Y + footprint.reach();
-  double e = Y;
-  for (int i = 0; i < 50; ++i) {
-    sum = Integrate(e, Y, footprint);
-    const double value = excess(sum, &behind);
-    (value > 0.0 ? low : high) = e;
-    double slope = scale * sum.energy_y;
-    if (behind) slope -= competing * Density(Y - e, footprint) / area;
-    double next = slope < 0.0 ? e - value / slope : low;
-    if (!(next > low && next < high)) next = 0.5 * (low + high);
-    const bool done = std::abs(next - e) < 1e-7;
-    e = next;
-    if (done) break;
-  }
-  if (d_silhouette != nullptr && sum.energy_y < 0.0 && !behind) {
-    *d_silhouette = -(sum.energy_Y - sum.energy / Y) / sum.energy_y;
+  if (d_silhouette != nullptr) {
+    const double near = Density(Y - e, footprint);
+    const double far = Density(Y + e, footprint);
+    *d_silhouette = e <= 0.0 ? 0.0 : near > far ? (near + far) / (near - far) : 1.0;
   }
   return e;
 }

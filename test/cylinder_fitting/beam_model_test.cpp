@@ -175,22 +175,34 @@ TEST(PredictRange, EqualsBruteForceOverTheFootprint) {
   EXPECT_GT(partial, 5) << "the limb must be among the cases";
 }
 
-TEST(DetectionOffset, IsWhereTheEnergyFallsToTheThreshold) {
+TEST(DetectionOffset, HandComputedShare) {
+  // A beam 24 mm wide: a fifth of it is 4.8 mm, so its centre is 7.2 mm outside the silhouette.
   Footprint footprint;
   footprint.half_width_m = 0.012;
-  for (const double radius : {0.01, 0.05, 0.3}) {
-    const double e = DetectionOffset(radius, 1.0, footprint, 0.2, 0.0);
-    BeamOnCone beam;
-    beam.valid = true;
-    beam.silhouette = radius;
-    beam.offset = e;
-    EXPECT_NEAR(PredictRange(beam, footprint).energy, 0.2, 1e-4) << radius;
-    double slope = 0.0;
-    DetectionOffset(radius, 1.0, footprint, 0.2, 0.0, &slope);
-    const double numeric = (DetectionOffset(radius + 1e-5, 1.0, footprint, 0.2, 0.0) -
-                            DetectionOffset(radius - 1e-5, 1.0, footprint, 0.2, 0.0)) / 2e-5;
-    EXPECT_NEAR(slope, numeric, 0.02 * std::abs(numeric)) << radius;
+  EXPECT_NEAR(DetectionOffset(0.1, 1.0, footprint, 0.2, 0.0), 0.1072, 1e-7);
+  EXPECT_NEAR(DetectionOffset(0.1, 1.0, footprint, 0.5, 0.0), 0.1, 1e-7);
+  // A twig of 4 mm fills a third of a centred beam, never a half.
+  EXPECT_GT(DetectionOffset(0.004, 1.0, footprint, 0.2, 0.0), 0.004);
+  EXPECT_EQ(DetectionOffset(0.004, 1.0, footprint, 0.5, 0.0), 0.0);
+}
+
+TEST(DetectionOffset, TrapezoidShareByCounting) {
+  Footprint footprint;
+  footprint.half_width_m = 0.012;
+  footprint.half_slope_m = 0.005;
+  const double e = DetectionOffset(0.05, 1.0, footprint, 0.2, 0.0);
+  int met = 0, all = 0;
+  for (int i = 0; i < 400; ++i) {
+    for (int j = 0; j < 400; ++j) {
+      const double u = 0.012 * (2.0 * (i + 0.5) / 400 - 1.0) + 0.005 * (2.0 * (j + 0.5) / 400 - 1.0);
+      met += std::abs(e + u) < 0.05;
+      ++all;
+    }
   }
+  EXPECT_NEAR(static_cast<double>(met) / all, 0.2, 0.003);
+  double slope = 0.0;
+  DetectionOffset(0.05, 1.0, footprint, 0.2, 0.0, &slope);
+  EXPECT_NEAR(slope, 1.0, 1e-6);
 }
 
 TEST(DetectionOffset, ThinRayEndsAtTheSilhouette) {

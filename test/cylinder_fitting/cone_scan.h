@@ -107,7 +107,8 @@ inline TestScan SimulateCones(const std::vector<TestCone>& cones,
       if (!near) continue;
       const Eigen::Vector3d h = Eigen::Vector3d::UnitZ().cross(d).normalized();
       const Eigen::Vector3d w = d.cross(h);
-      std::vector<double> energy(cones.size(), 0.0), range(cones.size(), 0.0);
+      std::vector<double> energy(cones.size(), 0.0), range(cones.size(), 0.0),
+          share(cones.size(), 0.0);
       for (int i = 0; i < across; ++i) {
         for (int j = 0; j < high; ++j) {
           const double x = (i + 0.5) / across - 0.5, y = (j + 0.5) / high - 0.5;
@@ -128,6 +129,7 @@ inline TestScan SimulateCones(const std::vector<TestCone>& cones,
           if (which < 0) continue;
           const double e = (sensor.footprint ? cosine : 1.0) / (across * high);
           energy[static_cast<std::size_t>(which)] += e;
+          share[static_cast<std::size_t>(which)] += 1.0 / (across * high);
           range[static_cast<std::size_t>(which)] += e * best;
         }
       }
@@ -139,7 +141,7 @@ inline TestScan SimulateCones(const std::vector<TestCone>& cones,
       }
       if (best < 0) continue;
       const auto b = static_cast<std::size_t>(best);
-      if (sensor.footprint && energy[b] < sensor.detection) continue;
+      if (sensor.footprint && share[b] < sensor.detection) continue;
       if (unit(rng) < sensor.dropout) continue;
       const double r = range[b] / energy[b] + sensor.sigma * gauss(rng) +
                        sensor.uniform * (2.0 * unit(rng) - 1.0);

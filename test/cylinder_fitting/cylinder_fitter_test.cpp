@@ -96,13 +96,17 @@ TEST(CylinderFitter, MarshallOnlyKeepsItsBias) {
   config.marshall_only = true;
   const CylinderFitter marshall(config), full;
   double plain = 0.0, better = 0.0;
-  for (unsigned seed = 1; seed <= 15; ++seed) {
-    const TestScan test = SimulateCones({Upright(3.0, 0.0, 0.05)}, TestSensor(), seed);
+  TestSensor sensor;
+  sensor.sigma = 0.02;
+  constexpr unsigned kTrials = 25;
+  for (unsigned seed = 1; seed <= kTrials; ++seed) {
+    sensor.azimuth_offset_deg = 0.0637 * seed;
+    const TestScan test = SimulateCones({Upright(3.0, 0.0, 0.05)}, sensor, seed);
     plain += marshall.FitSegment(test.scan, SegmentOf(test, 0)).cylinder.radius() - 0.05;
     better += full.FitSegment(test.scan, SegmentOf(test, 0)).cylinder.radius() - 0.05;
   }
-  EXPECT_LT(plain / 15.0, -0.001) << "eq. 4.2 shrinks a thin branch";
-  EXPECT_LT(std::abs(better / 15.0), 0.0005);
+  EXPECT_GT(std::abs(plain / kTrials), 0.002) << "eq. 4.2 shrinks a thin branch in noise";
+  EXPECT_LT(std::abs(better / kTrials), 0.0006);
 }
 
 TEST(CylinderFitter, TiltedBranchAndItsEnds) {

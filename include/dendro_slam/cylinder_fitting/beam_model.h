@@ -72,17 +72,17 @@ struct RangePrediction {
 };
 RangePrediction PredictRange(const BeamOnCone& beam, const Footprint& footprint);
 
-/// Largest |offset| at which a beam still reports a cone: it gets at least the share `energy` back,
-/// and more than a surface behind it that gets the rest of the beam.
+/// Largest |offset| at which a beam still reports a cone: at least `share` of the footprint meets it,
+/// and it sends back more than a surface behind it that gets the rest of the beam.
 /// @param sin_angle     Of beam and axis (BeamOnCone::sin_angle).
 /// @param competing     Energy of the whole beam on the surface behind, relative to the whole beam
 ///                      on the cone head-on; 0 where there is nothing behind.
 /// @param d_silhouette  Receives the derivative by the silhouette when not null.
-/// @return [m]; 0 when even a centred beam does not get it.
+/// @return [m]; 0 when even a centred beam does not report it.
 double DetectionOffset(double silhouette,
                        double sin_angle,
                        const Footprint& footprint,
-                       double energy,
+                       double share,
                        double competing,
                        double* d_silhouette = nullptr);
 

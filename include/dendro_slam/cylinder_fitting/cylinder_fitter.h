@@ -29,10 +29,10 @@ struct CylinderFitterConfig {
   double beam_exit_vertical_m = 0.0127;        ///< Height of the beam as it leaves [m]. >= 0.
   double beam_divergence_horizontal_rad = 3.0e-3;  ///< Full divergence in azimuth [rad]. >= 0.
   double beam_divergence_vertical_rad = 1.5e-3;    ///< Full divergence in elevation [rad]. >= 0.
-  double detection_fraction = 0.2;  ///< Energy that makes a return, of a full head-on hit. (0, 1).
+  double detection_fraction = 0.2;  ///< Share of the footprint that makes a return. (0, 1).
   double echo_separation_m = 0.76;  ///< Surfaces nearer to each other give one mixed return [m]. >= 0.
-  double edge_sigma_m = 0.0015;     ///< What the silhouette model leaves unknown, per edge [m]. > 0.
-  double edge_bias_sigma_m = 0.0007; ///< The same, common to all edges of a segment [m]. > 0.
+  double edge_sigma_m = 0.001;      ///< What the silhouette model leaves unknown, per edge [m]. > 0.
+  double edge_bias_sigma_m = 0.0004; ///< The same, common to all edges of a segment [m]. > 0.
   double ring_bias_sigma_m = 0.0;   ///< Offset of a laser's ranges against the others' [m]. >= 0.
 
   template <class Visitor>
