@@ -22,6 +22,7 @@ constexpr int kMaxIterations = 25;
 constexpr int kSettling = 3;
 // Squared length of the last step in standard deviations.
 constexpr double kConverged = 1e-3;
+constexpr double kLargestCycle = 25.0;
 
 // The state of the final estimator: the cone's tangent space and the error common to all edges.
 constexpr int kStates = 7;
@@ -578,8 +579,12 @@ Estimate SegmentFit::Refine(const Cone& start) const {
       estimate.converged = true;
       break;
     }
-    // A remaining cycle well inside the estimate's own sigma does not matter.
-    if (iteration == kMaxIterations - 1) estimate.converged = statistical < 1.0;
+    // An edge that is as likely false as true makes two solutions take turns. Both are near: the
+    // distance between them becomes part of the uncertainty.
+    if (iteration == kMaxIterations - 1 && statistical < kLargestCycle) {
+      estimate.covariance += step * step.transpose();
+      estimate.converged = true;
+    }
   }
   return estimate;
 }
