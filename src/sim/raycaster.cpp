@@ -191,14 +191,12 @@ struct Raycaster::Impl {
   void AddBranch(const SceneBranch& branch, const Surface& surface, std::vector<Reference>* refs);
   void BuildTree(const std::vector<Cell>& unsorted_cells);
 
-  template <class Order>
   void TestCell(const Cell& cell,
                 const Eigen::Vector3d& o,
                 const Eigen::Vector3d& d,
                 double min_m,
                 double max_m,
-                Best* best,
-                const Order& skip) const;
+                Best* best) const;
   double TestGround(const Eigen::Vector3d& o, const Eigen::Vector3d& d, double min_m, double max_m) const;
   RayHit Resolve(const Eigen::Vector3d& o, const Eigen::Vector3d& d, const Best& best) const;
 
@@ -423,14 +421,12 @@ void Raycaster::Impl::BuildTree(const std::vector<Cell>& unsorted_cells) {
   }
 }
 
-template <class Order>
 void Raycaster::Impl::TestCell(const Cell& cell,
                                const Eigen::Vector3d& o,
                                const Eigen::Vector3d& d,
                                double min_m,
                                double max_m,
-                               Best* best,
-                               const Order& skip) const {
+                               Best* best) const {
   for (std::uint32_t i = cell.first; i < cell.first + cell.count; ++i) {
     const double limit = std::min(max_m, best->range_m);
     double t = kNoHit;
@@ -442,12 +438,10 @@ void Raycaster::Impl::TestCell(const Cell& cell,
         t = IntersectCone(o, d, cones[primitive], min_m, limit, &normal);
         break;
       case PrimitiveKind::kDisc:
-        if (skip(discs[i].centre, discs[i].radius_m)) continue;
         t = IntersectDisc(o, d, discs[i].centre, discs[i].normal, discs[i].radius_m, min_m, limit);
         break;
       case PrimitiveKind::kTriangle: t = IntersectTriangle(o, d, triangles[i], min_m, limit); break;
       case PrimitiveKind::kSphere:
-        if (skip(spheres[i].centre, spheres[i].radius_m)) continue;
         t = IntersectSphere(o, d, spheres[i].centre, spheres[i].radius_m, min_m, limit);
         break;
       case PrimitiveKind::kBox: t = IntersectBox(o, d, boxes[i], min_m, limit, &normal); break;
@@ -545,7 +539,6 @@ std::optional<RayHit> Raycaster::Cast(const Eigen::Vector3d& origin,
     };
     std::array<Entry, kStack> stack;
     int depth = 0;
-    const auto never_skip = [](const Eigen::Vector3d&, double) { return false; };
     float far = limit();
     if (ray.Enter(impl.nodes[0], 0.0F, far) <= far) stack[depth++] = {0, 0.0F};
     while (depth > 0) {
@@ -555,7 +548,7 @@ std::optional<RayHit> Raycaster::Cast(const Eigen::Vector3d& origin,
       while (true) {
         const Node& node = impl.nodes[index];
         if (node.is_leaf != 0U) {
-          impl.TestCell(impl.cells[node.first], origin, direction, min_range_m, max_range_m, &best, never_skip);
+          impl.TestCell(impl.cells[node.first], origin, direction, min_range_m, max_range_m, &best);
           far = limit();
           break;
         }
@@ -617,7 +610,7 @@ void Raycaster::CastBundle(const RayBundle& bundle,
       }
       return ray.Enter(node, half_width + half_angle * std::min(distance, far), far);
     };
-    // A sphere around a primitive that the bundle cannot touch.
+    // True when the bundle cannot touch the sphere.
     const auto skip = [&](const Eigen::Vector3d& centre, double radius) {
       const Eigen::Vector3d m = centre - bundle.origin;
       const double along = m.dot(bundle.direction);
@@ -625,7 +618,6 @@ void Raycaster::CastBundle(const RayBundle& bundle,
                            static_cast<double>(half_angle) * (std::abs(along) + radius);
       return m.squaredNorm() - along * along > reach * reach;
     };
-    const auto never_skip = [](const Eigen::Vector3d&, double) { return false; };
     struct Entry {
       std::uint32_t node;
       float enter;
@@ -651,14 +643,12 @@ void Raycaster::CastBundle(const RayBundle& bundle,
               }
               const Cell single{cell.bounds, cell.kind, k, 1};
               for (std::size_t i = 0; i < n; ++i) {
-                impl.TestCell(single, bundle.origins[i], bundle.directions[i], 0.0, max_range_m, &best[i],
-                              never_skip);
+                impl.TestCell(single, bundle.origins[i], bundle.directions[i], 0.0, max_range_m, &best[i]);
               }
             }
           } else {
             for (std::size_t i = 0; i < n; ++i) {
-              impl.TestCell(cell, bundle.origins[i], bundle.directions[i], 0.0, max_range_m, &best[i],
-                            never_skip);
+              impl.TestCell(cell, bundle.origins[i], bundle.directions[i], 0.0, max_range_m, &best[i]);
             }
           }
           farthest = 0.0;
