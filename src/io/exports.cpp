@@ -64,7 +64,10 @@ std::string Element(std::uint32_t type, const std::string& data) {
   return out;
 }
 
-std::string MatrixHeader(std::uint32_t matrix_class, std::size_t rows, std::size_t cols, const std::string& name) {
+std::string MatrixHeader(std::uint32_t matrix_class,
+                         std::size_t rows,
+                         std::size_t cols,
+                         const std::string& name) {
   std::string flags, size;
   Append(&flags, matrix_class);
   Append(&flags, std::uint32_t{0});
@@ -85,7 +88,8 @@ std::string DoubleMatrix(const MatDouble& matrix) {
   for (std::size_t c = 0; c < matrix.cols; ++c) {
     for (std::size_t r = 0; r < rows; ++r) Append(&data, matrix.values[r * matrix.cols + c]);
   }
-  return Element(kMiMatrix, MatrixHeader(kMxDouble, rows, matrix.cols, "") + Element(kMiDouble, data));
+  return Element(kMiMatrix,
+                 MatrixHeader(kMxDouble, rows, matrix.cols, "") + Element(kMiDouble, data));
 }
 
 // Members in order: name, encoded matrix.
@@ -128,7 +132,8 @@ std::vector<Eigen::Vector2d> ConvexHull(std::vector<Eigen::Vector2d> points) {
   for (int pass = 0; pass < 2; ++pass) {
     const std::size_t start = hull.size();
     for (const Eigen::Vector2d& p : points) {
-      while (hull.size() >= start + 2 && Cross(hull[hull.size() - 2], hull.back(), p) <= 0.0) hull.pop_back();
+      while (hull.size() >= start + 2 && Cross(hull[hull.size() - 2], hull.back(), p) <= 0.0)
+        hull.pop_back();
       hull.push_back(p);
     }
     hull.pop_back();
@@ -138,7 +143,8 @@ std::vector<Eigen::Vector2d> ConvexHull(std::vector<Eigen::Vector2d> points) {
 }
 
 struct Crown {
-  double diameter_mean = 0.0, diameter_max = 0.0, area = 0.0, base_height = 0.0, length = 0.0, ratio = 0.0;
+  double diameter_mean = 0.0, diameter_max = 0.0, area = 0.0, base_height = 0.0, length = 0.0,
+         ratio = 0.0;
 };
 
 Crown MeasureCrown(const OrderedTree& ordered) {
@@ -172,7 +178,8 @@ Crown MeasureCrown(const OrderedTree& ordered) {
     crown.diameter_mean += (to - from) / kDirections;
   }
   for (const Eigen::Vector2d& a : hull) {
-    for (const Eigen::Vector2d& b : hull) crown.diameter_max = std::max(crown.diameter_max, (a - b).norm());
+    for (const Eigen::Vector2d& b : hull)
+      crown.diameter_max = std::max(crown.diameter_max, (a - b).norm());
   }
   crown.base_height = low - ordered.tree->base.z();
   crown.length = high - low;
@@ -227,7 +234,8 @@ OrderedTree OrderTree(const TreeModel& model, int tree_id) {
 }
 
 int CountUnattached(const TreeModel& model) {
-  return static_cast<int>(std::count_if(model.cylinders.begin(), model.cylinders.end(),
+  return static_cast<int>(std::count_if(model.cylinders.begin(),
+                                        model.cylinders.end(),
                                         [](const MapCylinder& c) { return c.tree_id < 0; }));
 }
 
@@ -238,10 +246,13 @@ int CountUnattached(const TreeModel& model) {
 std::string TreeQsmMat(const TreeModel& model, int tree_id) {
   const OrderedTree ordered = OrderTree(model, tree_id);
   const MapTree& tree = *ordered.tree;
-  std::vector<double> radius, length, parent, extension, added, unmodified, branch, coverage, mad, order, position;
+  std::vector<double> radius, length, parent, extension, added, unmodified, branch, coverage, mad,
+      order, position;
   MatDouble start{3, {}}, axis{3, {}}, taper{0, {}};
-  double volume[2] = {0.0, 0.0}, area[2] = {0.0, 0.0}, total_length[2] = {0.0, 0.0};  // trunk, branches
-  std::vector<double> branch_volume(ordered.branches.size(), 0.0), branch_area(ordered.branches.size(), 0.0);
+  double volume[2] = {0.0, 0.0}, area[2] = {0.0, 0.0},
+         total_length[2] = {0.0, 0.0};  // trunk, branches
+  std::vector<double> branch_volume(ordered.branches.size(), 0.0),
+      branch_area(ordered.branches.size(), 0.0);
   std::vector<double> stem_distance, stem_diameter;
   double dbh_qsm = 0.0, walked = 0.0;
   for (const OrderedTree::Entry& entry : ordered.cylinders) {
@@ -283,7 +294,8 @@ std::string TreeQsmMat(const TreeModel& model, int tree_id) {
   taper.values = stem_distance;
   taper.values.insert(taper.values.end(), stem_diameter.begin(), stem_diameter.end());
 
-  std::vector<double> b_order, b_parent, b_diameter, b_length, b_angle, b_height, b_azimuth, b_zenith;
+  std::vector<double> b_order, b_parent, b_diameter, b_length, b_angle, b_height, b_azimuth,
+      b_zenith;
   for (std::size_t i = 0; i < ordered.branches.size(); ++i) {
     const MapBranch& b = *ordered.branches[i];
     b_order.push_back(b.order);
@@ -350,24 +362,41 @@ std::string TreeQsmMat(const TreeModel& model, int tree_id) {
   header.resize(124, '\0');
   Append(&header, std::uint16_t{0x0100});
   header += "IM";
-  return header + StructMatrix("QSM", {{"cylinder", StructMatrix("", cylinder)},
-                                       {"branch", StructMatrix("", branches)},
-                                       {"treedata", StructMatrix("", treedata)}});
+  return header + StructMatrix("QSM",
+                               {{"cylinder", StructMatrix("", cylinder)},
+                                {"branch", StructMatrix("", branches)},
+                                {"treedata", StructMatrix("", treedata)}});
 }
 
 std::string TreeQsmCylinderText(const TreeModel& model, int tree_id) {
   std::string out =
-      "radius (m)\tlength (m)\tstart_point\taxis_direction\tparent\textension\tbranch\tbranch_order\t"
+      "radius (m)\tlength "
+      "(m)\tstart_point\taxis_direction\tparent\textension\tbranch\tbranch_order\t"
       "position_in_branch\tmad\tSurfCov\tadded\tUnmodRadius (m)\n";
   for (const OrderedTree::Entry& entry : OrderTree(model, tree_id).cylinders) {
     const MapCylinder& c = *entry.cylinder;
     const Vector3d axis = c.Axis();
     out += fmt::format(
-        "{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{}\t{}\t{}\t{}\t{}\t{:.4f}\t{:.4f}\t{}\t"
+        "{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{:.4f}\t{}\t{}\t{}\t{}\t{}\t{:.4f}"
+        "\t{:.4f}\t{}\t"
         "{:.4f}\n",
-        c.radius_m, c.Length(), c.start.x(), c.start.y(), c.start.z(), axis.x(), axis.y(), axis.z(),
-        entry.parent + 1, entry.extension + 1, entry.branch + 1, c.branch_order, c.position_in_branch + 1,
-        c.mean_abs_deviation_m, Coverage(c), c.status == FitStatus::kMeasured ? 0 : 1, c.radius_m);
+        c.radius_m,
+        c.Length(),
+        c.start.x(),
+        c.start.y(),
+        c.start.z(),
+        axis.x(),
+        axis.y(),
+        axis.z(),
+        entry.parent + 1,
+        entry.extension + 1,
+        entry.branch + 1,
+        c.branch_order,
+        c.position_in_branch + 1,
+        c.mean_abs_deviation_m,
+        Coverage(c),
+        c.status == FitStatus::kMeasured ? 0 : 1,
+        c.radius_m);
   }
   return out;
 }
@@ -379,8 +408,9 @@ std::string TreeQsmCylinderText(const TreeModel& model, int tree_id) {
 std::string SimpleForestCsv(const TreeModel& model, int tree_id) {
   const OrderedTree ordered = OrderTree(model, tree_id);
   const std::size_t n = ordered.cylinders.size();
-  // Growth length: all wood that a cylinder carries, itself included. Reverse order: steps of branching
-  // up to the farthest tip, 1 at the tips. A segment is the stretch of a branch between two junctions.
+  // Growth length: all wood that a cylinder carries, itself included. Reverse order: steps of
+  // branching up to the farthest tip, 1 at the tips. A segment is the stretch of a branch between
+  // two junctions.
   std::vector<double> growth(n, 0.0);
   std::vector<int> reverse(n, 1), children(n, 0), segment(n, 0), segment_parent;
   for (std::size_t i = n; i-- > 0;) {
@@ -403,33 +433,59 @@ std::string SimpleForestCsv(const TreeModel& model, int tree_id) {
     segment_parent.push_back(p < 0 ? -1 : segment[static_cast<std::size_t>(p)]);
   }
   std::string out =
-      "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius,length,growthLength,averagePointDistance,"
+      "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius,length,growthLength,"
+      "averagePointDistance,"
       "segmentID,parentSegmentID,branchOrder,reverseBranchOrder,branchID\n";
   for (std::size_t i = 0; i < n; ++i) {
     const OrderedTree::Entry& entry = ordered.cylinders[i];
     const MapCylinder& c = *entry.cylinder;
-    out += fmt::format("{},{},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{},{},{},{},{}\n",
-                       i, entry.parent, c.start.x(), c.start.y(), c.start.z(), c.end.x(), c.end.y(), c.end.z(),
-                       c.radius_m, c.Length(), growth[i], c.mean_abs_deviation_m, segment[i],
-                       segment_parent[static_cast<std::size_t>(segment[i])], c.branch_order, reverse[i], c.branch_id);
+    out += fmt::format(
+        "{},{},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{},{},{},{},{}"
+        "\n",
+        i,
+        entry.parent,
+        c.start.x(),
+        c.start.y(),
+        c.start.z(),
+        c.end.x(),
+        c.end.y(),
+        c.end.z(),
+        c.radius_m,
+        c.Length(),
+        growth[i],
+        c.mean_abs_deviation_m,
+        segment[i],
+        segment_parent[static_cast<std::size_t>(segment[i])],
+        c.branch_order,
+        reverse[i],
+        c.branch_id);
   }
   return out;
 }
 
 std::string RayCloudTreeFile(const TreeModel& model) {
-  // A segment's cylinder runs from its parent's point to its own. Our branches start at the parent's
-  // surface, so the run from the parent's axis to there is part of their first segment.
-  std::string out = "# tree structure file, written by dendro_slam\nx,y,z,radius,parent_id,section_id\n";
+  // A segment's cylinder runs from its parent's point to its own. Our branches start at the
+  // parent's surface, so the run from the parent's axis to there is part of their first segment.
+  std::string out =
+      "# tree structure file, written by dendro_slam\nx,y,z,radius,parent_id,section_id\n";
   for (const MapTree& tree : model.trees) {
     const OrderedTree ordered = OrderTree(model, tree.id);
     if (ordered.cylinders.empty()) continue;
     const MapCylinder& root = *ordered.cylinders.front().cylinder;
-    std::string line = fmt::format("{:.6f},{:.6f},{:.6f},{:.6f},-1,-1", root.start.x(), root.start.y(),
-                                   root.start.z(), StartRadius(root));
+    std::string line = fmt::format("{:.6f},{:.6f},{:.6f},{:.6f},-1,-1",
+                                   root.start.x(),
+                                   root.start.y(),
+                                   root.start.z(),
+                                   StartRadius(root));
     for (const OrderedTree::Entry& entry : ordered.cylinders) {
       const MapCylinder& c = *entry.cylinder;
-      line += fmt::format(", {:.6f},{:.6f},{:.6f},{:.6f},{},{}", c.end.x(), c.end.y(), c.end.z(), c.radius_m,
-                          entry.parent + 1, entry.branch);
+      line += fmt::format(", {:.6f},{:.6f},{:.6f},{:.6f},{},{}",
+                          c.end.x(),
+                          c.end.y(),
+                          c.end.z(),
+                          c.radius_m,
+                          entry.parent + 1,
+                          entry.branch);
     }
     out += line + "\n";
   }
@@ -441,12 +497,14 @@ std::vector<std::pair<std::string, std::string>> TreeLocFiles(const MapFiles& fi
   std::vector<std::pair<std::string, std::string>> out;
   std::string trajectory;
   int index = 0;
-  for (std::size_t i = 0; i < files.trajectory.size(); i += static_cast<std::size_t>(every), ++index) {
+  for (std::size_t i = 0; i < files.trajectory.size();
+       i += static_cast<std::size_t>(every), ++index) {
     const StampedPose& pose = files.trajectory[i];
     trajectory += TrajectoryTum({pose});
     const Eigen::Isometry3d T_lidar_map = pose.T_map_lidar.inverse();
     std::string table =
-        "axis_00,axis_01,axis_02,axis_10,axis_11,axis_12,axis_20,axis_21,axis_22,location_x,location_y,"
+        "axis_00,axis_01,axis_02,axis_10,axis_11,axis_12,axis_20,axis_21,axis_22,location_x,"
+        "location_y,"
         "location_z,dbh,dbh_approximation,score,reconstructed,number_clusters\n";
     for (const MapTree& tree : files.model.trees) {
       const OrderedTree ordered = OrderTree(files.model, tree.id);
@@ -467,9 +525,14 @@ std::vector<std::pair<std::string, std::string>> TreeLocFiles(const MapFiles& fi
       for (int r = 0; r < 3; ++r) {
         for (int c = 0; c < 3; ++c) table += fmt::format("{:.6f},", rotation(r, c));
       }
-      table += fmt::format("{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{},{}\n", location.x(), location.y(),
-                           location.z(), tree.dbh_m.value_or(0.0), 2.0 * stem->radius_m,
-                           std::clamp(tree.arc_coverage_rad / (2.0 * M_PI), 0.0, 1.0), tree.dbh_m ? 1 : 0,
+      table += fmt::format("{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{},{}\n",
+                           location.x(),
+                           location.y(),
+                           location.z(),
+                           tree.dbh_m.value_or(0.0),
+                           2.0 * stem->radius_m,
+                           std::clamp(tree.arc_coverage_rad / (2.0 * M_PI), 0.0, 1.0),
+                           tree.dbh_m ? 1 : 0,
                            tree.branch_ids.size());
     }
     out.emplace_back(fmt::format("TreeManagerState_{}.csv", index), std::move(table));

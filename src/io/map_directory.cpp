@@ -50,7 +50,8 @@ std::string Vec(const Eigen::Vector3d& v) {
 std::string Stamp(std::int64_t ns) {
   const std::uint64_t magnitude =
       ns < 0 ? 0 - static_cast<std::uint64_t>(ns) : static_cast<std::uint64_t>(ns);
-  return fmt::format("{}{}.{:09d}", ns < 0 ? "-" : "", magnitude / 1000000000, magnitude % 1000000000);
+  return fmt::format(
+      "{}{}.{:09d}", ns < 0 ? "-" : "", magnitude / 1000000000, magnitude % 1000000000);
 }
 
 // -------------------------------------------------------------------------------------------
@@ -145,10 +146,11 @@ Json LandmarkJson(const Landmark& landmark) {
   j["s_max_sigma_m"] = finite(landmark.s_max_sigma_m, "s_max_sigma_m of landmark");
   j["profile"] = Json::array();
   for (const RadiusKnot& knot : landmark.profile) {
-    j["profile"].push_back({{"s_m", finite(knot.s_m, "the radius profile of landmark")},
-                            {"radius_m", finite(knot.radius_m, "the radius profile of landmark")},
-                            {"radius_sigma_m", finite(knot.radius_sigma_m, "the radius profile of landmark")},
-                            {"num_scans", knot.num_scans}});
+    j["profile"].push_back(
+        {{"s_m", finite(knot.s_m, "the radius profile of landmark")},
+         {"radius_m", finite(knot.radius_m, "the radius profile of landmark")},
+         {"radius_sigma_m", finite(knot.radius_sigma_m, "the radius profile of landmark")},
+         {"num_scans", knot.num_scans}});
   }
   j["num_scans"] = landmark.num_scans;
   j["num_points"] = landmark.num_points;
@@ -285,7 +287,8 @@ Json TopologyJson(const TopologyState& state) {
     j["branch_of_landmark"].push_back({landmark, branch});
   }
   j["tree_of_branch"] = Json::array();
-  for (const auto& [branch, tree] : state.tree_of_branch) j["tree_of_branch"].push_back({branch, tree});
+  for (const auto& [branch, tree] : state.tree_of_branch)
+    j["tree_of_branch"].push_back({branch, tree});
   j["sections"] = Json::array();
   for (const auto& [key, sections] : state.sections) {
     Json list = Json::array();
@@ -444,7 +447,9 @@ LandmarkState ReadLandmarkState(const Reader& j) {
     for (std::size_t k = 0; k < num_bins; ++k) {
       const Reader values = bins.At(k);
       values.RequireSize(4);
-      RadiusProfile::Bin bin{values.At(0).NonNegative(), values.At(1).Double(), values.At(2).Double(),
+      RadiusProfile::Bin bin{values.At(0).NonNegative(),
+                             values.At(1).Double(),
+                             values.At(2).Double(),
                              values.At(3).NonNegative()};
       if (!(bin.weight > 0.0)) values.At(1).Fail("is not positive");
       if (!knot.bins.empty() && bin.index <= knot.bins.back().index) {
@@ -879,7 +884,8 @@ MapFiles LoadMap(const std::string& directory) {
     throw MapFileError(fmt::format("{}: the file is not JSON: {}", file, error.what()));
   }
   const Reader j(json, file, "");
-  if (j["format"].String() != kFormatName) j["format"].Fail(fmt::format("is not '{}'", kFormatName));
+  if (j["format"].String() != kFormatName)
+    j["format"].Fail(fmt::format("is not '{}'", kFormatName));
   const int version = j["version"].Int();
   if (version != kFormatVersion) {
     j["version"].Fail(fmt::format("is {}, this program reads {}", version, kFormatVersion));
@@ -979,8 +985,12 @@ void ScanWriter::Add(const LabelledScan& scan,
     const Eigen::Vector3d start = fit.cylinder.point + fit.start_s_m * fit.cylinder.axis;
     const Eigen::Vector3d end = fit.cylinder.point + fit.end_s_m * fit.cylinder.axis;
     const auto sigma = [&](int i) { return std::sqrt(std::max(0.0, fit.covariance(i, i))); };
-    cylinders_ << fmt::format("{},{},{},{},{},{},", Stamp(stamp), fit.segment_id, fit.num_points,
-                              fit.num_rings, Num(fit.distance_m),
+    cylinders_ << fmt::format("{},{},{},{},{},{},",
+                              Stamp(stamp),
+                              fit.segment_id,
+                              fit.num_points,
+                              fit.num_rings,
+                              Num(fit.distance_m),
                               Num(fit.visible_arc_rad * kDegPerRad, 2));
     if (measured) {
       cylinders_ << fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},",

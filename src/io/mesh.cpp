@@ -14,14 +14,21 @@ namespace dendro {
 namespace {
 
 // Okabe and Ito 2008, "Color Universal Design"; black is left out, it is for the trunk's outline.
-constexpr std::array<Rgb, 7> kOkabeIto = {Rgb{230, 159, 0},  Rgb{86, 180, 233}, Rgb{0, 158, 115},
-                                          Rgb{240, 228, 66}, Rgb{0, 114, 178},  Rgb{213, 94, 0},
+constexpr std::array<Rgb, 7> kOkabeIto = {Rgb{230, 159, 0},
+                                          Rgb{86, 180, 233},
+                                          Rgb{0, 158, 115},
+                                          Rgb{240, 228, 66},
+                                          Rgb{0, 114, 178},
+                                          Rgb{213, 94, 0},
                                           Rgb{204, 121, 167}};
 constexpr Rgb kTrunkColor = {120, 94, 66};
 constexpr Rgb kInferredColor = {170, 170, 170};
 // Cividis (Nunez et al. 2018) at 0, 0.25, 0.5, 0.75 and 1.
-constexpr std::array<Rgb, 5> kCividis = {Rgb{0, 34, 78}, Rgb{66, 78, 108}, Rgb{124, 123, 120},
-                                         Rgb{187, 174, 104}, Rgb{255, 234, 70}};
+constexpr std::array<Rgb, 5> kCividis = {Rgb{0, 34, 78},
+                                         Rgb{66, 78, 108},
+                                         Rgb{124, 123, 120},
+                                         Rgb{187, 174, 104},
+                                         Rgb{255, 234, 70}};
 
 std::uint8_t Mix(std::uint8_t a, std::uint8_t b, double f) {
   return static_cast<std::uint8_t>(std::lround((1.0 - f) * a + f * b));

@@ -7,8 +7,8 @@
 #include <utility>
 #include <vector>
 
-#include <CLI/CLI.hpp>
 #include <fmt/format.h>
+#include <CLI/CLI.hpp>
 
 #include "dendro_slam/io/exports.h"
 #include "dendro_slam/io/map_directory.h"
@@ -23,24 +23,37 @@ using namespace dendro;
 std::string NameOfTree(const std::string& output, int tree_id, bool several) {
   if (!several) return output;
   const fs::path path(output);
-  return (path.parent_path() / fmt::format("{}_{}{}", path.stem().string(), tree_id, path.extension().string()))
+  return (path.parent_path() /
+          fmt::format("{}_{}{}", path.stem().string(), tree_id, path.extension().string()))
       .string();
 }
 
 }  // namespace
 
 int main(int argc, char** argv) {
-  CLI::App app("Writes a map directory in the formats of other tools. Formats with one tree per file add the "
-               "tree's id to the name where the map holds several.");
+  CLI::App app(
+      "Writes a map directory in the formats of other tools. Formats with one tree per file add "
+      "the "
+      "tree's id to the name where the map holds several.");
   std::string map_dir, format, output;
   int tree = -1, every = 10;
   app.add_option("MAP_DIR", map_dir, "Map directory of map_bag or of the save service")->required();
-  app.add_option("-f,--format", format,
-                 "treeqsm-mat, treeqsm-txt, simpleforest, raycloudtools, treeloc (a folder), ply-branch, "
-                 "ply-order, ply-sigma, json, csv (a folder with our own tables)")
+  app.add_option(
+         "-f,--format",
+         format,
+         "treeqsm-mat, treeqsm-txt, simpleforest, raycloudtools, treeloc (a folder), ply-branch, "
+         "ply-order, ply-sigma, json, csv (a folder with our own tables)")
       ->required()
-      ->check(CLI::IsMember({"treeqsm-mat", "treeqsm-txt", "simpleforest", "raycloudtools", "treeloc",
-                             "ply-branch", "ply-order", "ply-sigma", "json", "csv"}));
+      ->check(CLI::IsMember({"treeqsm-mat",
+                             "treeqsm-txt",
+                             "simpleforest",
+                             "raycloudtools",
+                             "treeloc",
+                             "ply-branch",
+                             "ply-order",
+                             "ply-sigma",
+                             "json",
+                             "csv"}));
   app.add_option("-o,--output", output, "File (or folder) to write")->required();
   app.add_option("--tree", tree, "Only this tree (formats with one tree per file)");
   app.add_option("--every", every, "treeloc: every n-th pose is a key frame")
@@ -63,11 +76,13 @@ int main(int argc, char** argv) {
         throw MapFileError(tree < 0 ? fmt::format("{} holds no tree", map_dir)
                                     : fmt::format("{} holds no tree {}", map_dir, tree));
       }
-      for (const int id : ids) outputs.emplace_back(NameOfTree(output, id, ids.size() > 1), make(model, id));
+      for (const int id : ids)
+        outputs.emplace_back(NameOfTree(output, id, ids.size() > 1), make(model, id));
     };
     const auto into_folder = [&](const std::vector<std::pair<std::string, std::string>>& contents) {
       fs::create_directories(output);
-      for (const auto& [name, content] : contents) outputs.emplace_back((fs::path(output) / name).string(), content);
+      for (const auto& [name, content] : contents)
+        outputs.emplace_back((fs::path(output) / name).string(), content);
     };
     if (format == "treeqsm-mat") one_per_tree(TreeQsmMat);
     if (format == "treeqsm-txt") one_per_tree(TreeQsmCylinderText);
@@ -82,9 +97,12 @@ int main(int argc, char** argv) {
                    {"branches.csv", BranchesCsv(model)},
                    {"trees.csv", TreesCsv(model)}});
     }
-    if (format == "ply-branch") outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByBranch)));
-    if (format == "ply-order") outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByOrder)));
-    if (format == "ply-sigma") outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kBySigma)));
+    if (format == "ply-branch")
+      outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByBranch)));
+    if (format == "ply-order")
+      outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByOrder)));
+    if (format == "ply-sigma")
+      outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kBySigma)));
     if (format == "json") outputs.emplace_back(output, TreeMapJson(files));
     for (const auto& [path, content] : outputs) WriteFileAtomically(path, content);
     const int unattached = CountUnattached(model);

@@ -41,10 +41,13 @@ double FrustumVolume(double length, double r0, double r1) {
 
 }  // namespace
 
-std::optional<StemDiameter> DiameterAtHeight(
-    const TreeModel& model, const MapTree& tree, double height_m, double window_m, double max_gap_m) {
-  // The radius of a cylinder holds along its whole length through its taper: every measured one that
-  // reaches into the window is cut to it and speaks for the stretch that is left.
+std::optional<StemDiameter> DiameterAtHeight(const TreeModel& model,
+                                             const MapTree& tree,
+                                             double height_m,
+                                             double window_m,
+                                             double max_gap_m) {
+  // The radius of a cylinder holds along its whole length through its taper: every measured one
+  // that reaches into the window is cut to it and speaks for the stretch that is left.
   double sw = 0.0, swx = 0.0, swxx = 0.0, swy = 0.0, swxy = 0.0, sws = 0.0;
   double below = -1e300, above = 1e300;
   bool covered = false;
@@ -157,8 +160,8 @@ void MeasureTrees(double breast_height_m, double min_volume_radius_m, TreeModel*
       tree.num_scans = std::max(tree.num_scans, c.num_scans);
     }
 
-    // Lean: from the stem's base to its tip. Coverage: the least seen measured part of the stem that
-    // the DBH rests on, or of the whole stem where there is no DBH.
+    // Lean: from the stem's base to its tip. Coverage: the least seen measured part of the stem
+    // that the DBH rests on, or of the whole stem where there is no DBH.
     const std::vector<const MapCylinder*> stem = Stem(*model, tree);
     if (stem.empty()) continue;
     const Eigen::Vector3d run = stem.back()->end - stem.front()->start;
@@ -166,7 +169,9 @@ void MeasureTrees(double breast_height_m, double min_volume_radius_m, TreeModel*
     double arc = -1.0, arc_at_breast_height = -1.0;
     for (const MapCylinder* c : stem) {
       if (c->status != FitStatus::kMeasured) continue;
-      const auto least = [&](double a) { return a < 0.0 ? c->visible_arc_rad : std::min(a, c->visible_arc_rad); };
+      const auto least = [&](double a) {
+        return a < 0.0 ? c->visible_arc_rad : std::min(a, c->visible_arc_rad);
+      };
       arc = least(arc);
       const double low = c->start.z() - tree.base.z(), high = c->end.z() - tree.base.z();
       if (low <= breast_height_m + 0.2 && high >= breast_height_m - 0.2) {

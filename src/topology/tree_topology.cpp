@@ -38,7 +38,10 @@ struct ClosestPoints {
 };
 
 // Closest points of segments p0 p1 and q0 q1 (Ericson, "Real-Time Collision Detection", 5.1.9).
-ClosestPoints ClosestOfSegments(const Vector3d& p0, const Vector3d& p1, const Vector3d& q0, const Vector3d& q1) {
+ClosestPoints ClosestOfSegments(const Vector3d& p0,
+                                const Vector3d& p1,
+                                const Vector3d& q0,
+                                const Vector3d& q1) {
   const Vector3d d1 = p1 - p0, d2 = q1 - q0, r = p0 - q0;
   const double a = d1.squaredNorm(), e = d2.squaredNorm(), f = d2.dot(r), c = d1.dot(r);
   double s = 0.0, t = 0.0;
@@ -109,10 +112,10 @@ struct ChainEnd {
 
 // How a chain may hang on another.
 struct Attachment {
-  int parent = -1;      // chain
-  int child_end = 0;    // 0: the first link's entry, 1: the last link's exit
+  int parent = -1;    // chain
+  int child_end = 0;  // 0: the first link's entry, 1: the last link's exit
   double cost = kInfinity;
-  double gap = 0.0;     // along the child's outward direction to the parent's surface; < 0 inside
+  double gap = 0.0;  // along the child's outward direction to the parent's surface; < 0 inside
   Vector3d junction = Vector3d::Zero();  // on the parent's axis
 };
 
@@ -128,7 +131,8 @@ void CheckLandmark(const Landmark& landmark) {
               std::isfinite(landmark.cylinder.curvature) && landmark.cylinder.curvature > 0.0,
           "cylinder is not finite");
   require(landmark.covariance.allFinite(), "covariance is not finite");
-  require(std::isfinite(landmark.s_min_m) && std::isfinite(landmark.s_max_m), "extent is not finite");
+  require(std::isfinite(landmark.s_min_m) && std::isfinite(landmark.s_max_m),
+          "extent is not finite");
   for (const RadiusKnot& knot : landmark.profile) {
     require(std::isfinite(knot.s_m) && std::isfinite(knot.radius_m) &&
                 std::isfinite(knot.radius_sigma_m),
@@ -151,7 +155,8 @@ std::vector<Piece> MakePieces(const std::vector<Landmark>& landmarks) {
   std::set<int> ids;
   for (const Landmark& landmark : landmarks) {
     CheckLandmark(landmark);
-    if (!ids.insert(landmark.id).second) throw std::invalid_argument(Name(landmark, "id is used twice"));
+    if (!ids.insert(landmark.id).second)
+      throw std::invalid_argument(Name(landmark, "id is used twice"));
     if (!landmark.confirmed || !(landmark.s_max_m > landmark.s_min_m)) continue;
     Piece piece;
     piece.landmark = &landmark;
@@ -211,7 +216,8 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
       if (std::abs(a.landmark->cylinder.axis.dot(b.landmark->cylinder.axis)) < cos_bend) continue;
       // No end of one is anywhere near an end of the other.
       const double far = config.join_gap_m + config.join_offset_m + 1.0 + a.length + b.length;
-      if ((a.landmark->cylinder.point - b.landmark->cylinder.point).squaredNorm() > 4.0 * far * far) continue;
+      if ((a.landmark->cylinder.point - b.landmark->cylinder.point).squaredNorm() > 4.0 * far * far)
+        continue;
       for (int e = 0; e < 2; ++e) {
         for (int f = 0; f < 2; ++f) {
           const Vector3d u = a.Outward(e), v = b.Outward(f);
@@ -267,7 +273,8 @@ void FinishChain(const std::vector<Piece>& pieces, Chain* chain) {
   chain->center = 0.5 * (chain->runs.front().p0 + chain->runs.back().p1);
   chain->reach = 0.0;
   for (const Run& run : chain->runs) {
-    chain->reach = std::max({chain->reach, (run.p0 - chain->center).norm() + run.r0,
+    chain->reach = std::max({chain->reach,
+                             (run.p0 - chain->center).norm() + run.r0,
                              (run.p1 - chain->center).norm() + run.r1});
   }
 }
@@ -303,8 +310,10 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
   }
   for (std::size_t i = 0; i < arms.size(); ++i) {
     for (std::size_t k = i + 1; k < arms.size(); ++k) {
-      const double ratio = std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
-      if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) && ratio < kForkRadiusRatio) {
+      const double ratio =
+          std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
+      if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) &&
+          ratio < kForkRadiusRatio) {
         return true;
       }
     }
@@ -369,9 +378,7 @@ std::vector<Chain> MakeChains(const std::vector<Piece>& pieces, const TopologyCo
 // -------------------------------------------------------------------------------------------
 
 // The best way for one end of a chain to hang on another chain.
-Attachment Attach(const ChainEnd& end,
-                  const Chain& parent,
-                  const TopologyConfig& config) {
+Attachment Attach(const ChainEnd& end, const Chain& parent, const TopologyConfig& config) {
   Attachment best;
   const double reach = config.attach_reach_m;
   const double back = std::min(0.5 * end.length, 0.4);
@@ -410,9 +417,10 @@ Attachment Attach(const ChainEnd& end,
       best.junction = q0 + s_full * axis;
     };
 
-    const ClosestPoints closest =
-        ClosestOfSegments(ray0, end.point + (reach + std::max(run.r0, run.r1)) * end.outward, q0, q1);
-    consider(closest.s * (back + reach + std::max(run.r0, run.r1)) - back, closest.t * full,
+    const ClosestPoints closest = ClosestOfSegments(
+        ray0, end.point + (reach + std::max(run.r0, run.r1)) * end.outward, q0, q1);
+    consider(closest.s * (back + reach + std::max(run.r0, run.r1)) - back,
+             closest.t * full,
              closest.distance);
     // A base that touches the parent without heading for its axis.
     const double s_end = std::clamp((end.point - q0).dot(axis), 0.0, full);
@@ -444,7 +452,8 @@ std::vector<int> MinimumArborescence(int num_vertices, int root, const std::vect
     if (edge.to == root || edge.from == edge.to) continue;
     if (chosen[edge.to] < 0 || edge.cost < edges[chosen[edge.to]].cost) chosen[edge.to] = e;
   }
-  // Follow the cheapest edges backwards from every vertex: whoever meets the own path closes a ring.
+  // Follow the cheapest edges backwards from every vertex: whoever meets the own path closes a
+  // ring.
   enum class State { kNew, kOnPath, kDone };
   std::vector<State> state(num_vertices, State::kNew);
   state[root] = State::kDone;
@@ -513,7 +522,8 @@ std::vector<double> SectionCuts(const Landmark& landmark,
       if (pending - start > 0.0 && pending - start >= config.min_section_length_m) {
         cuts.push_back(pending);
       } else {
-        cuts.push_back(start + (k - start) / std::ceil((k - start) / config.max_section_length_m - 1e-9));
+        cuts.push_back(start +
+                       (k - start) / std::ceil((k - start) / config.max_section_length_m - 1e-9));
       }
     }
     pending = k;
@@ -745,7 +755,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       if (chains[root].mean_radius < config_.min_trunk_radius_m) continue;
       if (children[root].empty() && chains[root].length < 1.0) continue;
       const auto rank = [&](int c) {
-        return chains[c].mean_radius * chains[c].length * (1.0 + static_cast<double>(children[c].size()));
+        return chains[c].mean_radius * chains[c].length *
+               (1.0 + static_cast<double>(children[c].size()));
       };
       if (best < 0 || rank(root) > rank(best)) best = root;
     }
@@ -782,7 +793,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       std::map<int, double> length_of;
       for (const Link& link : chains[c].links) {
         const auto it = state_.branch_of_landmark.find(pieces[link.piece].landmark->id);
-        if (it != state_.branch_of_landmark.end()) length_of[it->second] += pieces[link.piece].length;
+        if (it != state_.branch_of_landmark.end())
+          length_of[it->second] += pieces[link.piece].length;
       }
       for (const auto& [id, length] : length_of) votes.emplace_back(-length, id, c);
     }
@@ -864,9 +876,11 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       if (hang[c].gap < -0.01) trim(0, true, -hang[c].gap);
       if (hang[c].gap > config_.min_gap_m) {
         const auto [base, radius, sigma] = at(0, true);
-        AddInferred({first_id, -1},
-                    InferredSection(base + hang[c].gap * outward, base, radius, radius, sigma, sigma),
-                    config_.max_section_length_m, &sections[c]);
+        AddInferred(
+            {first_id, -1},
+            InferredSection(base + hang[c].gap * outward, base, radius, radius, sigma, sigma),
+            config_.max_section_length_m,
+            &sections[c]);
       }
     } else if (is_tree[c] && ground_z_m && outward.z() < -0.5) {
       const auto [base, radius, sigma] = at(0, true);
@@ -874,7 +888,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       if (down > config_.min_gap_m && down <= config_.max_trunk_base_m) {
         AddInferred({first_id, -1},
                     InferredSection(base + down * outward, base, radius, radius, sigma, sigma),
-                    config_.max_section_length_m, &sections[c]);
+                    config_.max_section_length_m,
+                    &sections[c]);
       }
     }
     for (int k = 0; k < num_links; ++k) {
@@ -885,13 +900,15 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         const auto [p0, r0, sigma0] = at(k - 1, false);
         const auto [p1, r1, sigma1] = at(k, true);
         const Vector3d direction =
-            (before.Outward(chain.links[k - 1].ExitEnd()) - piece.Outward(link.EntryEnd())).normalized();
+            (before.Outward(chain.links[k - 1].ExitEnd()) - piece.Outward(link.EntryEnd()))
+                .normalized();
         const double along = (p1 - p0).dot(direction);
         if (along > config_.min_gap_m) {
           const int a = before.landmark->id, b = piece.landmark->id;
           AddInferred({std::min(a, b), std::max(a, b)},
                       InferredSection(p0, p1, r0, r1, sigma0, sigma1),
-                      config_.max_section_length_m, &sections[c]);
+                      config_.max_section_length_m,
+                      &sections[c]);
         }
       }
       // Pieces that overlap meet in the middle of the overlap.
@@ -900,7 +917,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         const auto [p0, r0, sigma0] = at(k, false);
         const auto [p1, r1, sigma1] = at(k + 1, true);
         const Vector3d direction =
-            (piece.Outward(link.ExitEnd()) - after.Outward(chain.links[k + 1].EntryEnd())).normalized();
+            (piece.Outward(link.ExitEnd()) - after.Outward(chain.links[k + 1].EntryEnd()))
+                .normalized();
         const double along = (p1 - p0).dot(direction);
         if (along < 0.0) {
           trim(k, false, -0.5 * along);

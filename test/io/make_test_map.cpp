@@ -16,7 +16,8 @@ int main(int argc, char** argv) {
   const auto add_tree = [&](double x, double y, int branches) {
     const auto add = [&](const Eigen::Vector3d& a, const Eigen::Vector3d& b, double r0, double r1) {
       const Eigen::Vector3d o(x, y, 0.0);
-      files.landmarks.push_back(MakeLandmark(static_cast<int>(files.landmarks.size()), a + o, b + o, r0, r1));
+      files.landmarks.push_back(
+          MakeLandmark(static_cast<int>(files.landmarks.size()), a + o, b + o, r0, r1));
     };
     add({0, 0, 0}, {0, 0, 5}, 0.2, 0.1);
     for (int i = 0; i < branches; ++i) {
@@ -40,7 +41,8 @@ int main(int argc, char** argv) {
   } else if (kind != "empty") {
     return 2;
   }
-  for (std::size_t i = 0; i < files.landmarks.size(); ++i) files.landmarks[i].id = static_cast<int>(i);
+  for (std::size_t i = 0; i < files.landmarks.size(); ++i)
+    files.landmarks[i].id = static_cast<int>(i);
   files.next_landmark_id = static_cast<int>(files.landmarks.size());
   TreeTopology topology{TopologyConfig()};
   files.model = topology.Build(files.landmarks, 1000);
@@ -48,7 +50,8 @@ int main(int argc, char** argv) {
   for (int i = 0; i < 21; ++i) {
     StampedPose pose;
     pose.stamp_ns = 1000000000LL + 100000000LL * i;
-    pose.T_map_lidar.linear() = Eigen::AngleAxisd(0.1 * i, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+    pose.T_map_lidar.linear() =
+        Eigen::AngleAxisd(0.1 * i, Eigen::Vector3d::UnitZ()).toRotationMatrix();
     pose.T_map_lidar.translation() = Eigen::Vector3d(4.0, -2.0 + 0.1 * i, 1.5);
     files.trajectory.push_back(pose);
   }

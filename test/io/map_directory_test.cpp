@@ -77,7 +77,8 @@ MapFiles SomeMap() {
   state.id = 4;
   state.line = files.landmarks[1].cylinder;
   state.covariance = files.landmarks[1].covariance;
-  state.profile.set_knots({{-2, {{3, 1.0 / 7e-6, 0.05 / 7e-6, 5}, {8, 40000.0, 2001.0, 2}}, 7}, {1, {}, 0}});
+  state.profile.set_knots(
+      {{-2, {{3, 1.0 / 7e-6, 0.05 / 7e-6, 5}, {8, 40000.0, 2001.0, 2}}, 7}, {1, {}, 0}});
   state.first_cell = -9;
   state.coverage = {3, 5, 0, 7};
   state.num_scans = 7;
@@ -105,8 +106,14 @@ TEST_F(Directory, WhatIsSavedIsLoaded) {
   StageTimer timer;
   timer.Add("total", 3.0);
   SaveMap(map_, saved, &timer);
-  EXPECT_THAT(Names(), testing::ElementsAre("branches.csv", "cylinders.csv", "timing.json", "trajectory.tum",
-                                            "tree.ply", "tree_map.json", "trees.csv"));
+  EXPECT_THAT(Names(),
+              testing::ElementsAre("branches.csv",
+                                   "cylinders.csv",
+                                   "timing.json",
+                                   "trajectory.tum",
+                                   "tree.ply",
+                                   "tree_map.json",
+                                   "trees.csv"));
   const MapFiles loaded = LoadMap(map_);
   ASSERT_EQ(loaded.landmarks.size(), saved.landmarks.size());
   for (std::size_t i = 0; i < saved.landmarks.size(); ++i) {
@@ -148,7 +155,9 @@ TEST_F(Directory, WhatIsSavedIsLoaded) {
   ASSERT_EQ(loaded.trajectory.size(), 5u);
   for (std::size_t i = 0; i < 5; ++i) {
     EXPECT_EQ(loaded.trajectory[i].stamp_ns, saved.trajectory[i].stamp_ns);
-    EXPECT_LT((loaded.trajectory[i].T_map_lidar.matrix() - saved.trajectory[i].T_map_lidar.matrix()).norm(), 1e-8);
+    EXPECT_LT((loaded.trajectory[i].T_map_lidar.matrix() - saved.trajectory[i].T_map_lidar.matrix())
+                  .norm(),
+              1e-8);
   }
   // The model and the ids are equal too: everything writes the same bytes again.
   EXPECT_EQ(CylindersCsv(loaded.model), CylindersCsv(saved.model));
@@ -184,14 +193,16 @@ TEST_F(Directory, TablesByHand) {
   c.num_points = 99;
   model.cylinders = {c};
   const std::string text = CylindersCsv(model);
-  EXPECT_THAT(text, HasSubstr("\n,2,3,,0,0,0.000000,0.000000,0.000000,0.000000,0.000000,2.000000,"
-                              "0.000000,0.000000,1.000000,2.000000,0.125000,0.001000,-0.010000,0.5730,"
-                              "0.000000,4,99,180.0,0.000000,MEASURED\n"));
-  EXPECT_THAT(text.substr(0, text.find('\n')),
-              testing::StrEq("tree_id,branch_id,cylinder_id,parent_cylinder_id,branch_order,"
-                             "position_in_branch,start_x,start_y,start_z,end_x,end_y,end_z,axis_x,axis_y,"
-                             "axis_z,length_m,radius_m,radius_sigma_m,taper_m_per_m,axis_sigma_deg,"
-                             "position_sigma_m,num_scans,num_points,visible_arc_deg,mad_m,status"));
+  EXPECT_THAT(text,
+              HasSubstr("\n,2,3,,0,0,0.000000,0.000000,0.000000,0.000000,0.000000,2.000000,"
+                        "0.000000,0.000000,1.000000,2.000000,0.125000,0.001000,-0.010000,0.5730,"
+                        "0.000000,4,99,180.0,0.000000,MEASURED\n"));
+  EXPECT_THAT(
+      text.substr(0, text.find('\n')),
+      testing::StrEq("tree_id,branch_id,cylinder_id,parent_cylinder_id,branch_order,"
+                     "position_in_branch,start_x,start_y,start_z,end_x,end_y,end_z,axis_x,axis_y,"
+                     "axis_z,length_m,radius_m,radius_sigma_m,taper_m_per_m,axis_sigma_deg,"
+                     "position_sigma_m,num_scans,num_points,visible_arc_deg,mad_m,status"));
   MapTree tree;
   tree.id = 1;
   tree.branch_ids = {0, 1, 2};
@@ -200,9 +211,12 @@ TEST_F(Directory, TablesByHand) {
   tree.height_m = 7.5;
   model.trees = {tree, tree};
   model.trees[1].dbh_m.reset();
-  EXPECT_THAT(TreesCsv(model), AllOf(HasSubstr("\n1,0.000000,0.000000,0.000000,0.300000,0.002000,1.3000,7.500000,2,0,"),
-                                     HasSubstr(",,,1.3000,7.500000,2,0,"), HasSubstr(",MEASURED\n"),
-                                     HasSubstr(",UNRESOLVED\n")));
+  EXPECT_THAT(
+      TreesCsv(model),
+      AllOf(HasSubstr("\n1,0.000000,0.000000,0.000000,0.300000,0.002000,1.3000,7.500000,2,0,"),
+            HasSubstr(",,,1.3000,7.500000,2,0,"),
+            HasSubstr(",MEASURED\n"),
+            HasSubstr(",UNRESOLVED\n")));
   StampedPose pose;
   pose.stamp_ns = 5;
   EXPECT_EQ(TrajectoryTum({pose}),
@@ -236,7 +250,8 @@ TEST_F(Directory, DiskFullLeavesTheOldMapWhole) {
     message = error.what();
   }
   setrlimit(RLIMIT_FSIZE, &old);
-  EXPECT_THAT(message, AllOf(HasSubstr("cannot write"), HasSubstr("tree_map.json"), Not(HasSubstr("\n"))));
+  EXPECT_THAT(message,
+              AllOf(HasSubstr("cannot write"), HasSubstr("tree_map.json"), Not(HasSubstr("\n"))));
   EXPECT_EQ(before, Read("tree_map.json") + Read("cylinders.csv"));
   EXPECT_EQ(Names().size(), 6u);  // no temporary file is left
   SaveMap(map_, bigger);
@@ -277,20 +292,21 @@ TEST_F(Directory, NumbersThatAreNotFiniteAreNotSaved) {
 TEST_F(Directory, BadFilesAreRefusedWithFileAndField) {
   SaveMap(map_, SomeMap());
   const std::string good = Read("tree_map.json");
-  const auto expect = [&](const std::string& from, const std::string& to, const std::string& field) {
-    const std::size_t at = good.find(from);
-    ASSERT_NE(at, std::string::npos) << from;
-    std::string text = good;
-    text.replace(at, from.size(), to);
-    Write("tree_map.json", text);
-    try {
-      LoadMap(map_);
-      ADD_FAILURE() << "accepted " << to;
-    } catch (const MapFileError& error) {
-      EXPECT_THAT(error.what(),
-                  AllOf(HasSubstr("tree_map.json"), HasSubstr(field), Not(HasSubstr("\n"))));
-    }
-  };
+  const auto expect =
+      [&](const std::string& from, const std::string& to, const std::string& field) {
+        const std::size_t at = good.find(from);
+        ASSERT_NE(at, std::string::npos) << from;
+        std::string text = good;
+        text.replace(at, from.size(), to);
+        Write("tree_map.json", text);
+        try {
+          LoadMap(map_);
+          ADD_FAILURE() << "accepted " << to;
+        } catch (const MapFileError& error) {
+          EXPECT_THAT(error.what(),
+                      AllOf(HasSubstr("tree_map.json"), HasSubstr(field), Not(HasSubstr("\n"))));
+        }
+      };
   expect("\"version\": 1", "\"version\": 2", "version is 2");
   expect("dendro_slam tree map", "some other map", "format");
   expect("\"frame\": \"map\"", "\"frame\": 3", "frame");
@@ -303,7 +319,8 @@ TEST_F(Directory, BadFilesAreRefusedWithFileAndField) {
   expect("\"status\":\"MEASURED\"", "\"status\":\"GUESSED\"", "status");
   expect("\"next_branch_id\":", "\"next_branch_id\":0,\"was\":", "topology.branch_of_landmark");
   expect("\"id\":4", "\"id\":0", "is used twice");
-  expect("\"knots\":[{\"index\":-2", "\"knots\":[{\"index\":9", "landmark_states[0].knots[1].index");
+  expect(
+      "\"knots\":[{\"index\":-2", "\"knots\":[{\"index\":9", "landmark_states[0].knots[1].index");
   expect("\"coverage\":[3,", "\"coverage\":[3.5,", "landmark_states[0].coverage[0]");
   expect("\"upright\": true", "\"upright\": 1", "upright");
   expect("\"stamp_ns\": ", "\"stamp_ns\": 1e400, \"was\": ", "JSON");
@@ -395,11 +412,15 @@ TEST_F(Directory, ScansAreStreamed) {
   std::getline(table, header);
   std::getline(table, first);
   std::getline(table, second);
-  EXPECT_EQ(std::count(header.begin(), header.end(), ','), std::count(first.begin(), first.end(), ','));
-  EXPECT_EQ(std::count(header.begin(), header.end(), ','), std::count(second.begin(), second.end(), ','));
-  EXPECT_THAT(first, AllOf(HasSubstr("1.500000000,0,"), HasSubstr(",0.100000,0.5730,"),
-                           HasSubstr(",0.002000,4.000000,0.000000,-0.500000,4.000000,0.000000,0.500000,"),
-                           HasSubstr(",MEASURED,")));
+  EXPECT_EQ(std::count(header.begin(), header.end(), ','),
+            std::count(first.begin(), first.end(), ','));
+  EXPECT_EQ(std::count(header.begin(), header.end(), ','),
+            std::count(second.begin(), second.end(), ','));
+  EXPECT_THAT(first,
+              AllOf(HasSubstr("1.500000000,0,"),
+                    HasSubstr(",0.100000,0.5730,"),
+                    HasSubstr(",0.002000,4.000000,0.000000,-0.500000,4.000000,0.000000,0.500000,"),
+                    HasSubstr(",MEASURED,")));
   EXPECT_THAT(second, HasSubstr("UNRESOLVED,too few rings"));
   {
     ScanWriter unfinished((root_ / "other").string());
@@ -422,7 +443,8 @@ TEST(StageTimer, PercentilesByHand) {
   EXPECT_EQ(summaries.at("b").p99_ms, 7.0);
   timer.set_data_duration_s(10.0);
   timer.set_wall_duration_s(4.0);
-  EXPECT_THAT(TimingJson(timer), AllOf(HasSubstr("\"realtime_factor\": 2.5"), HasSubstr("\"p99_ms\": 99.0")));
+  EXPECT_THAT(TimingJson(timer),
+              AllOf(HasSubstr("\"realtime_factor\": 2.5"), HasSubstr("\"p99_ms\": 99.0")));
   EXPECT_THAT(TimingJson(StageTimer()), HasSubstr("\"realtime_factor\": null"));
 }
 

@@ -19,12 +19,12 @@ namespace {
 using Eigen::Vector3d;
 
 struct Perturbation {
-  double axis_deg = 0.0;        // sigma of either component
-  double position_m = 0.0;      // sigma of either component
-  double radius_relative = 0.0; // sigma
-  double hidden_ratio = 0.0;    // pieces that are not there
-  double base_gap_m = 0.03;     // branches are seen from this far outside their parent's surface on
-  double end_gap_m = 0.01;      // taken off either end of every piece, up to twice
+  double axis_deg = 0.0;         // sigma of either component
+  double position_m = 0.0;       // sigma of either component
+  double radius_relative = 0.0;  // sigma
+  double hidden_ratio = 0.0;     // pieces that are not there
+  double base_gap_m = 0.03;  // branches are seen from this far outside their parent's surface on
+  double end_gap_m = 0.01;   // taken off either end of every piece, up to twice
 };
 
 struct TruthOfLandmark {
@@ -42,7 +42,8 @@ double DistanceInside(const SceneBranch& parent, const Vector3d& p) {
   return inside;
 }
 
-// Cuts every branch thicker than min_radius into straight pieces of at most 2 m and 8 degrees of bend.
+// Cuts every branch thicker than min_radius into straight pieces of at most 2 m and 8 degrees of
+// bend.
 std::vector<Landmark> LandmarksOf(const SceneTree& tree,
                                   int tree_index,
                                   const Perturbation& perturbation,
@@ -65,7 +66,8 @@ std::vector<Landmark> LandmarksOf(const SceneTree& tree,
         p.position = (1.0 - f) * a.position + f * b.position;
         p.radius_m = (1.0 - f) * a.radius_m + f * b.radius_m;
         if (p.radius_m < 0.015) continue;
-        if (parent != nullptr && DistanceInside(*parent, p.position) > -perturbation.base_gap_m) continue;
+        if (parent != nullptr && DistanceInside(*parent, p.position) > -perturbation.base_gap_m)
+          continue;
         points.push_back(p);
       }
     }
@@ -77,7 +79,8 @@ std::vector<Landmark> LandmarksOf(const SceneTree& tree,
       while (last + 1 < points.size() && (points[last + 1].position - start).norm() < 2.0) {
         const Vector3d end_direction =
             (points[last + 1].position - points[last - 3].position).normalized();
-        if (std::acos(std::clamp(direction.dot(end_direction), -1.0, 1.0)) > 8.0 * M_PI / 180.0) break;
+        if (std::acos(std::clamp(direction.dot(end_direction), -1.0, 1.0)) > 8.0 * M_PI / 180.0)
+          break;
         ++last;
       }
       Vector3d p0 = points[first].position, p1 = points[last].position;
@@ -109,11 +112,11 @@ std::vector<Landmark> LandmarksOf(const SceneTree& tree,
 }
 
 struct Score {
-  int branches = 0;        // true branches with a landmark
-  int parents = 0;         // of them with a parent that has landmarks
+  int branches = 0;  // true branches with a landmark
+  int parents = 0;   // of them with a parent that has landmarks
   int parent_right = 0;
   int order_right = 0;
-  int whole = 0;           // all landmarks in one branch of the model
+  int whole = 0;                     // all landmarks in one branch of the model
   int pure = 0, model_branches = 0;  // branches of the model of one true branch only
   int trunks = 0, trees = 0;
 };
@@ -159,9 +162,10 @@ void AddScore(const std::vector<SceneTree>& trees,
     ++score->branches;
     score->whole += found.size() == 1 ? 1 : 0;
     // The branch of the model with most of this true branch's landmarks.
-    const int branch = std::max_element(found.begin(), found.end(), [](const auto& a, const auto& b) {
-                         return a.second < b.second;
-                       })->first;
+    const int branch =
+        std::max_element(found.begin(), found.end(), [](const auto& a, const auto& b) {
+          return a.second < b.second;
+        })->first;
     const MapBranch& b = *branches.at(branch);
     score->order_right += b.tree_id >= 0 && b.order == order[key] ? 1 : 0;
     const int parent = trees[static_cast<std::size_t>(key.first)].FindBranch(key.second)->parent;
@@ -193,9 +197,21 @@ Score ScoreForm(const char* form, const Perturbation& perturbation, int num_tree
     TreeTopology topology{TopologyConfig()};
     AddScore(trees, topology.Build(landmarks, 0), truth, &score);
   }
-  std::printf("%-10s branches %d, parent right %d/%d, order right %d/%d, whole %d/%d, pure %d/%d, trunks %d/%d\n",
-              form, score.branches, score.parent_right, score.parents, score.order_right, score.branches,
-              score.whole, score.branches, score.pure, score.model_branches, score.trunks, score.trees);
+  std::printf(
+      "%-10s branches %d, parent right %d/%d, order right %d/%d, whole %d/%d, pure %d/%d, trunks "
+      "%d/%d\n",
+      form,
+      score.branches,
+      score.parent_right,
+      score.parents,
+      score.order_right,
+      score.branches,
+      score.whole,
+      score.branches,
+      score.pure,
+      score.model_branches,
+      score.trunks,
+      score.trees);
   return score;
 }
 
@@ -237,7 +253,9 @@ TEST_P(GeneratedTrees, PiecesHidden) {
   EXPECT_GE(score.parent_right, 0.85 * score.parents);
 }
 
-INSTANTIATE_TEST_SUITE_P(Forms, GeneratedTrees, testing::Values("excurrent", "decurrent", "columnar"));
+INSTANTIATE_TEST_SUITE_P(Forms,
+                         GeneratedTrees,
+                         testing::Values("excurrent", "decurrent", "columnar"));
 
 }  // namespace
 }  // namespace dendro

@@ -236,10 +236,9 @@ TEST(TreeTopology, IdsStayWhileTheMapGrows) {
 
 TEST(TreeTopology, OppositeBranchesOfATrunkAreTwo) {
   // Horizontal, at the same height: each looks like the continuation of the other.
-  const std::vector<Landmark> landmarks = {
-      MakeLandmark(0, {0, 0, 0}, {0, 0, 4}, 0.15, 0.12),
-      MakeLandmark(1, {0.2, 0, 2}, {1.5, 0, 2}, 0.05, 0.04),
-      MakeLandmark(2, {-0.2, 0, 2}, {-1.5, 0, 2}, 0.05, 0.04)};
+  const std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 4}, 0.15, 0.12),
+                                           MakeLandmark(1, {0.2, 0, 2}, {1.5, 0, 2}, 0.05, 0.04),
+                                           MakeLandmark(2, {-0.2, 0, 2}, {-1.5, 0, 2}, 0.05, 0.04)};
   TreeTopology topology{TopologyConfig()};
   const TreeModel model = topology.Build(landmarks, 0);
   ASSERT_EQ(model.branches.size(), 3u);

@@ -30,9 +30,9 @@ class MapFileError : public std::runtime_error {
 /// Everything a map directory holds.
 struct MapFiles {
   TreeModel model;
-  std::vector<Landmark> landmarks;      ///< As people read them; candidates too.
-  MapSnapshot snapshot;                 ///< What Mapper::Load needs so that a loaded map goes on:
-                                        ///< tree_map.json holds it complete (every LandmarkState).
+  std::vector<Landmark> landmarks;  ///< As people read them; candidates too.
+  MapSnapshot snapshot;             ///< What Mapper::Load needs so that a loaded map goes on:
+                                    ///< tree_map.json holds it complete (every LandmarkState).
   int next_landmark_id = 0;
   TopologyState topology;
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.
@@ -40,13 +40,13 @@ struct MapFiles {
   std::map<std::string, std::string> config;  ///< "section/key" to value, as the run used it.
 };
 
-/// Writes `tree_map.json`, `cylinders.csv`, `branches.csv`, `trees.csv`, `trajectory.tum`, `tree.ply`
-/// and, with a timer, `timing.json` into `directory` (made if missing).
+/// Writes `tree_map.json`, `cylinders.csv`, `branches.csv`, `trees.csv`, `trajectory.tum`,
+/// `tree.ply` and, with a timer, `timing.json` into `directory` (made if missing).
 ///
 /// Every file is first written completely under a temporary name in the same directory and synced
-/// to disk; only when all are there are they renamed, tree_map.json last. If anything fails (disk full,
-/// no permission) the temporary files are removed and the map that was there stays whole. Same
-/// input, same bytes: only timing.json differs between two runs.
+/// to disk; only when all are there are they renamed, tree_map.json last. If anything fails (disk
+/// full, no permission) the temporary files are removed and the map that was there stays whole.
+/// Same input, same bytes: only timing.json differs between two runs.
 /// @throws MapFileError  One line: file, and the reason the system gave.
 void SaveMap(const std::string& directory,
              const MapFiles& files,
@@ -72,10 +72,10 @@ void WriteFileAtomically(const std::string& path, const std::string& content);
 /// Writes what single scans gave: `scan_cylinders.csv` (one row per segment), `scan_labels.bin` and
 /// `scan_segments.bin`, streamed scan by scan.
 ///
-/// scan_labels.bin: magic "DSLABEL1", then per scan int64 stamp_ns, uint32 count, count x uint8 Label
-/// in the order of the source cloud. scan_segments.bin: magic "DSSEGMT1", then per scan int64 stamp_ns,
-/// uint32 count, count x int32 segment id (-1 none), count x float32 range [m] (NaN where the point could
-/// not be projected). All little-endian.
+/// scan_labels.bin: magic "DSLABEL1", then per scan int64 stamp_ns, uint32 count, count x uint8
+/// Label in the order of the source cloud. scan_segments.bin: magic "DSSEGMT1", then per scan int64
+/// stamp_ns, uint32 count, count x int32 segment id (-1 none), count x float32 range [m] (NaN where
+/// the point could not be projected). All little-endian.
 class ScanWriter {
  public:
   /// @throws MapFileError

@@ -16,14 +16,14 @@ using Rgb = std::array<std::uint8_t, 3>;
 /// Triangles with one colour per vertex, metres.
 struct Mesh {
   std::vector<Eigen::Vector3d> vertices;
-  std::vector<Rgb> colors;                       ///< One per vertex.
+  std::vector<Rgb> colors;                             ///< One per vertex.
   std::vector<std::array<std::int32_t, 3>> triangles;  ///< Counter-clockwise seen from outside.
 };
 
 enum class MeshColor { kByBranch, kByOrder, kBySigma };
 
-/// Colour of a branch: Okabe and Ito's palette, safe for colour-blind readers, by id; every second round
-/// of its seven colours is darker.
+/// Colour of a branch: Okabe and Ito's palette, safe for colour-blind readers, by id; every second
+/// round of its seven colours is darker.
 Rgb BranchColor(int branch_id);
 /// Colour of a branch order (0 trunk).
 Rgb OrderColor(int order);
@@ -32,7 +32,8 @@ Rgb SigmaColor(double relative_sigma, double max_relative = 0.2);
 /// Colour of one cylinder under a scheme; INFERRED ones are paler.
 Rgb CylinderColor(const MapCylinder& cylinder, MeshColor scheme);
 
-/// Radius of a cylinder at its start (base end) and end (tip end), from its taper, never below zero.
+/// Radius of a cylinder at its start (base end) and end (tip end), from its taper, never below
+/// zero.
 double StartRadius(const MapCylinder& cylinder);
 double EndRadius(const MapCylinder& cylinder);
 

@@ -5,14 +5,15 @@
 
 #include "dendro_slam/mapping/tree_model.h"
 
-/// Measures of trees from their cylinders. The lists of a model are sorted by id, as TreeTopology builds them.
+/// Measures of trees from their cylinders. The lists of a model are sorted by id, as TreeTopology
+/// builds them.
 namespace dendro {
 
 /// Diameter of a stem at one height.
 struct StemDiameter {
-  double height_m = 0.0;      ///< Above the tree's base [m].
+  double height_m = 0.0;  ///< Above the tree's base [m].
   double diameter_m = 0.0;
-  double sigma_m = 0.0;       ///< Standard deviation of the diameter [m].
+  double sigma_m = 0.0;                     ///< Standard deviation of the diameter [m].
   FitStatus status = FitStatus::kMeasured;  ///< kInferred where it lies in a bridged gap.
 };
 
@@ -22,12 +23,13 @@ struct WoodVolume {
   double sigma_m3 = 0.0;
 };
 
-/// Diameter of a tree's trunk at a height above its base: the straight line r(h) through the trunk's
-/// measured cylinders within `window_m` above and below, weighted by their sigmas; where there are
-/// none, interpolated between the nearest measured ones if they are at most `max_gap_m` apart.
+/// Diameter of a tree's trunk at a height above its base: the straight line r(h) through the
+/// trunk's measured cylinders within `window_m` above and below, weighted by their sigmas; where
+/// there are none, interpolated between the nearest measured ones if they are at most `max_gap_m`
+/// apart.
 ///
-/// Errors of neighbouring cylinders are common (same scans, same side), so the sigma is the weighted
-/// mean of theirs and does not shrink with their number.
+/// Errors of neighbouring cylinders are common (same scans, same side), so the sigma is the
+/// weighted mean of theirs and does not shrink with their number.
 ///
 /// @return Nothing where the trunk was not seen around that height.
 std::optional<StemDiameter> DiameterAtHeight(const TreeModel& model,

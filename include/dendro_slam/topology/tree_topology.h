@@ -22,14 +22,15 @@ struct TopologyConfig {
   double join_angle_deg = 30.0;       ///< Largest bend between two pieces of one branch [deg].
   double join_offset_m = 0.06;        ///< Sideways miss allowed beside radius and bend [m]. >= 0.
   double join_radius_ratio = 1.8;     ///< Largest step of the radius at a joint. > 1.
-  double attach_reach_m = 1.0;        ///< Farthest from a parent's surface a base may end [m]. >= 0.
-  double attach_offset_m = 0.08;      ///< Sideways miss of the parent's surface allowed [m]. >= 0.
-  double min_gap_m = 0.05;            ///< Shorter gaps are closed without a cylinder [m]. >= 0.
-  double max_trunk_lean_deg = 50.0;   ///< A root that leans more is no trunk [deg].
-  double min_trunk_radius_m = 0.03;   ///< A thinner root is no trunk [m]. > 0.
-  double max_trunk_base_m = 2.5;      ///< A root that begins this much above the lowest is no trunk [m].
-  double breast_height_m = 1.3;       ///< Above the tree's base [m]. > 0.
-  double min_volume_radius_m = 0.025; ///< Thinner wood is left out of the volumes [m]. >= 0.
+  double attach_reach_m = 1.0;       ///< Farthest from a parent's surface a base may end [m]. >= 0.
+  double attach_offset_m = 0.08;     ///< Sideways miss of the parent's surface allowed [m]. >= 0.
+  double min_gap_m = 0.05;           ///< Shorter gaps are closed without a cylinder [m]. >= 0.
+  double max_trunk_lean_deg = 50.0;  ///< A root that leans more is no trunk [deg].
+  double min_trunk_radius_m = 0.03;  ///< A thinner root is no trunk [m]. > 0.
+  double max_trunk_base_m =
+      2.5;                       ///< A root that begins this much above the lowest is no trunk [m].
+  double breast_height_m = 1.3;  ///< Above the tree's base [m]. > 0.
+  double min_volume_radius_m = 0.025;  ///< Thinner wood is left out of the volumes [m]. >= 0.
 
   /// @throws std::invalid_argument naming the field that is out of range.
   void Validate() const;
@@ -94,7 +95,8 @@ class TreeTopology {
   /// @param ground_z_m Height of the ground in the map frame where it is known: trees then stand on
   ///                   it instead of on the lowest wood seen.
   /// @return Cylinders, branches and trees, each sorted by id; branches from base to tip.
-  /// @throws std::invalid_argument for landmarks with numbers that are not finite or ids that repeat.
+  /// @throws std::invalid_argument for landmarks with numbers that are not finite or ids that
+  /// repeat.
   TreeModel Build(const std::vector<Landmark>& landmarks,
                   std::int64_t stamp_ns,
                   std::optional<double> ground_z_m = std::nullopt);
