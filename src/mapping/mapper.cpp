@@ -86,6 +86,7 @@ void MapperConfig::Validate() const {
   Require(key_frame_time_s > 0.0, "key_frame_time_s must be > 0");
   Require(vio_walk_m_per_sqrt_m >= 0.0, "vio_walk_m_per_sqrt_m must be >= 0");
   Require(vio_walk_rad_per_sqrt_m >= 0.0, "vio_walk_rad_per_sqrt_m must be >= 0");
+  Require(vio_tilt_walk_rad_per_sqrt_m >= 0.0, "vio_tilt_walk_rad_per_sqrt_m must be >= 0");
   Require(vio_sigma_m_per_m >= 0.0, "vio_sigma_m_per_m must be >= 0");
   Require(vio_sigma_per_rad >= 0.0, "vio_sigma_per_rad must be >= 0");
   Require(vio_sigma_floor_rad > 0.0, "vio_sigma_floor_rad must be > 0");
@@ -184,7 +185,8 @@ class Mapper::Impl {
   };
 
   std::vector<FittedCylinder> Usable(const std::vector<FittedCylinder>& cylinders) const;
-  UncertainMotion VioMotion(const Eigen::Isometry3d& T) const;
+  UncertainMotion VioMotion(const Eigen::Isometry3d& T_odom_from,
+                            const Eigen::Isometry3d& T_odom_to) const;
   void Evaluate(const std::vector<FittedCylinder>& cylinders, Hypothesis* h) const;
   FittedCylinder Conditioned(const FittedCylinder& fit,
                              const Landmark& landmark,
@@ -234,20 +236,25 @@ std::vector<FittedCylinder> Mapper::Impl::Usable(
   return out;
 }
 
-// Noise of a VIO motion: a random walk and a scale error, as visual-inertial odometry drifts.
-UncertainMotion Mapper::Impl::VioMotion(const Eigen::Isometry3d& T) const {
+// Noise of a VIO motion: a random walk and a scale error, as visual-inertial odometry drifts. It sees
+// gravity, so its tilt drifts less than its heading.
+UncertainMotion Mapper::Impl::VioMotion(const Eigen::Isometry3d& T_odom_from,
+                                        const Eigen::Isometry3d& T_odom_to) const {
+  const Eigen::Isometry3d T = T_odom_from.inverse() * T_odom_to;
   const Vector6d xi = LogSe3(T);
   const double distance = xi.tail<3>().norm(), angle = xi.head<3>().norm();
   const auto square = [](double x) { return x * x; };
-  const double rotation = square(config.vio_sigma_floor_rad) +
-                          square(config.vio_walk_rad_per_sqrt_m) * distance +
-                          square(config.vio_sigma_per_rad * angle);
+  const double floor = square(config.vio_sigma_floor_rad) + square(config.vio_sigma_per_rad * angle);
+  const double heading = floor + square(config.vio_walk_rad_per_sqrt_m) * distance;
+  const double tilt = floor + square(config.vio_tilt_walk_rad_per_sqrt_m) * distance;
+  const Eigen::Vector3d up = T_odom_to.linear().transpose() * Eigen::Vector3d::UnitZ();
   const double translation = square(config.vio_sigma_floor_m) +
                              square(config.vio_walk_m_per_sqrt_m) * distance +
                              square(config.vio_sigma_m_per_m * distance);
   UncertainMotion out;
   out.T = T;
-  out.covariance.diagonal().head<3>().setConstant(rotation);
+  out.covariance.topLeftCorner<3, 3>() =
+      tilt * Eigen::Matrix3d::Identity() + (heading - tilt) * up * up.transpose();
   out.covariance.diagonal().tail<3>().setConstant(translation);
   return out;
 }
@@ -304,10 +311,17 @@ void Mapper::Impl::Evaluate(const std::vector<FittedCylinder>& cylinders, Hypoth
     T = refined;
   }
   h->T_kf_lidar = T;
-  h->score = 0.0;
+  // Twice the logarithm of the evidence, up to what all hypotheses share. A vague prior can be bent to
+  // fit anything: the last term is what it pays for that.
+  const Vector6d moved = LogSe3(h->kf_now.T.inverse() * T);
+  h->score = -moved.dot(prior_information * moved);
   for (const Match& match : h->matches) {
     h->score += std::max(0.0, 20.0 - match.mahalanobis2);
   }
+  const auto log_det = [](const Matrix6d& m) {
+    return m.ldlt().vectorD().cwiseMax(1e-300).array().log().sum();
+  };
+  h->score -= log_det(h->kf_now.covariance) - log_det(P);
 }
 
 bool Mapper::Impl::InsideALandmark(const FittedCylinder& fit,
@@ -365,7 +379,7 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
   } else {
     bool any = false;
     if (h.uses_vio && T_odom_kf && input.T_odom_lidar) {
-      const UncertainMotion vio = VioMotion(T_odom_kf->inverse() * *input.T_odom_lidar);
+      const UncertainMotion vio = VioMotion(*T_odom_kf, *input.T_odom_lidar);
       factors.push_back(std::make_shared<BetweenFactor>(
           PoseKey(index - 1),
           PoseKey(index),
@@ -632,7 +646,7 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     std::optional<UncertainMotion> vio, icp;
     bool suspicious = false;
     if (scan.T_odom_lidar && T_odom_last) {
-      vio = VioMotion(T_odom_last->inverse() * *scan.T_odom_lidar);
+      vio = VioMotion(*T_odom_last, *scan.T_odom_lidar);
       const Vector6d xi = LogSe3(vio->T);
       if (xi.tail<3>().norm() > config.max_speed_mps * dt + 0.05 ||
           xi.head<3>().norm() > config.max_turn_rad_per_s * dt + 0.05) {
@@ -685,14 +699,14 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     if (vio && hypotheses.front().score < 0.5 * last_score - 10.0) suspicious = true;
     if (suspicious) {
       if (icp && vio) {
-        add(*icp, false, true);
+        add(velocity ? Fuse(*icp, blind) : *icp, false, true);
         add(*vio, true, false);
       }
       if (vio) add(blind, false, false);
     }
     std::size_t chosen = 0;
     for (std::size_t i = 1; i < hypotheses.size(); ++i) {
-      if (hypotheses[i].score > 1.2 * hypotheses[chosen].score + 5.0) chosen = i;
+      if (hypotheses[i].score > hypotheses[chosen].score + 10.0) chosen = i;
     }
     best = std::move(hypotheses[chosen]);
     if (suspicious && vio && !best.uses_vio) result.odometry_rejected = true;

@@ -21,7 +21,8 @@ struct MapperConfig {
 
   // Odometry. The messages' own covariances do not tell the drift.
   double vio_walk_m_per_sqrt_m = 0.012;   ///< Random walk per axis per root metre travelled. >= 0.
-  double vio_walk_rad_per_sqrt_m = 0.003; ///< Random walk of the rotation per root metre [rad]. >= 0.
+  double vio_walk_rad_per_sqrt_m = 0.003; ///< Random walk of the heading per root metre [rad]. >= 0.
+  double vio_tilt_walk_rad_per_sqrt_m = 0.001;  ///< Of roll and pitch: gravity is seen [rad]. >= 0.
   double vio_sigma_m_per_m = 0.006;     ///< Scale error: translation drift per metre travelled. >= 0.
   double vio_sigma_per_rad = 0.005;     ///< Rotation drift per radian turned. >= 0.
   double vio_sigma_floor_rad = 0.0008;  ///< Of one step, per axis [rad]. > 0.
@@ -69,6 +70,7 @@ struct MapperConfig {
     v("key_frame_time_s", key_frame_time_s);
     v("vio_walk_m_per_sqrt_m", vio_walk_m_per_sqrt_m);
     v("vio_walk_rad_per_sqrt_m", vio_walk_rad_per_sqrt_m);
+    v("vio_tilt_walk_rad_per_sqrt_m", vio_tilt_walk_rad_per_sqrt_m);
     v("vio_sigma_m_per_m", vio_sigma_m_per_m);
     v("vio_sigma_per_rad", vio_sigma_per_rad);
     v("vio_sigma_floor_rad", vio_sigma_floor_rad);
