@@ -167,10 +167,8 @@ class TreeMapping : public nodelet::Nodelet {
     const dendro::MapperResult result = stage_->Process(input);
     diagnostics_->Processed(input.stamp_ns, watch.Seconds());
     if (!result.warning.empty()) NODELET_WARN_THROTTLE(5.0, "%s", result.warning.c_str());
-    if (!gate_->mount_error().empty()) {
-      diagnostics_->Problem(gate_->mount_error());
-      NODELET_ERROR_THROTTLE(10.0, "%s", gate_->mount_error().c_str());
-    }
+    // WoodSegmentation needs the same transform and says on the console what is missing.
+    if (!gate_->mount_error().empty()) diagnostics_->Problem(gate_->mount_error());
     PublishStatus(result, input, watch.Seconds());
     if (config_.publish_tf) PublishTransforms(result, header, T_odom_body);
     if (result.is_key_frame) PublishMap();

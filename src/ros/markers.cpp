@@ -207,7 +207,7 @@ visualization_msgs::MarkerArray MapMarkers(const dendro::TreeModel& model,
                                            const std::string& frame_id) {
   constexpr float kAlpha = 0.9F;
   constexpr double kSkeletonWidthM = 0.02;
-  constexpr double kLabelHeightM = 0.14;
+  constexpr double kLabelHeightM = 0.2;
   constexpr double kLabelGapM = 0.12;
   visualization_msgs::MarkerArray markers;
   markers.markers.push_back(DeleteAll(model.stamp_ns, frame_id));
