@@ -8,6 +8,9 @@
 #include <gtest/gtest.h>
 
 #include "dendro_slam/segmentation/safetensors.h"
+#include "dendro_slam/sim/flight_path.h"
+#include "dendro_slam/sim/raycaster.h"
+#include "dendro_slam/sim/scene.h"
 #include "dendro_slam/sim/training_scans.h"
 #include "synthetic_scan.h"
 
@@ -57,6 +60,29 @@ TEST(WoodSegmenterNetwork, ThesisScenes) {
   EXPECT_GT(scores.wood_iou, 0.96);
   EXPECT_GT(scores.accuracy, 0.99);
   EXPECT_GT(scores.recall, 0.97);
+}
+
+TEST(WoodSegmenterNetwork, ThesisFlight) {
+  const std::string config = std::string(DENDRO_SOURCE_DIR) + "/config/";
+  const Scene scene = LoadScene(config + "scenes/thesis_tree.yaml");
+  const FlightPath path = LoadFlightPath(config + "paths/thesis_quadrangle.yaml");
+  const Raycaster raycaster(scene);
+  const LidarSimulator simulator(raycaster, Lidar(), path.start_stamp_ns);
+  WoodSegmenter segmenter{WoodSegmenterConfig()};
+  Projector projector;
+  std::vector<Label> labels;
+  std::vector<Label> truth;
+  for (int i = 20; i < simulator.NumScans(path.duration_s); i += 160) {
+    const SimulatedScan simulated =
+        simulator.SimulateScan(i, [&path](std::int64_t t) { return path.LidarPose(t); });
+    RangeImage image = projector.Project(simulated.scan, nullptr);
+    const std::vector<Label> expected = PixelTruth(image, simulated.truth);
+    const LabelledScan result = segmenter.Segment(std::move(image));
+    labels.insert(labels.end(), result.label.begin(), result.label.end());
+    truth.insert(truth.end(), expected.begin(), expected.end());
+  }
+  EXPECT_GT(test::WoodIou(labels, truth), 0.95);
+  EXPECT_GT(test::Accuracy(labels, truth), 0.995);
 }
 
 TEST(WoodSegmenterNetwork, LeaflessScenes) {
