@@ -121,10 +121,34 @@ TreeMappingStage::TreeMappingStage(const TreeMappingConfig& config)
   config.Validate();
 }
 
-MapperResult TreeMappingStage::Process(const MapperInput& input) {
+MapperResult TreeMappingStage::Process(const MapperInput& input,
+                                       const std::optional<GroundPlane>& ground) {
   MapperResult result = mapper_.AddScan(input);
-  if (result.is_key_frame) model_ = topology_.Build(mapper_.Landmarks(), result.stamp_ns);
+  if (ground && !mapper_.relocalizing()) AddGround(*ground, result.T_map_lidar);
+  if (result.is_key_frame) {
+    model_ = topology_.Build(mapper_.Landmarks(), result.stamp_ns, GroundHeight());
+  }
   return result;
+}
+
+void TreeMappingStage::AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
+  constexpr double kMinUp = 0.9;        // A steeper plane is a bank, or the map is not upright.
+  constexpr double kMaxReach_m = 10.0;  // Farther off the slope decides.
+  if (model_.trees.size() != 1) return;
+  const Eigen::Vector3d& base = model_.trees.front().base;
+  const Eigen::Vector3d normal = T_map_lidar.linear() * ground.normal.cast<double>();
+  const Eigen::Vector3d lidar = T_map_lidar.translation();
+  if (normal.z() < kMinUp || (base - lidar).head<2>().norm() > kMaxReach_m) return;
+  // Height(p) = normal . (p - lidar) + offset = 0 below the base.
+  const double sideways = normal.head<2>().dot((base - lidar).head<2>());
+  ground_z_sum_m_ += lidar.z() - (ground.offset + sideways) / normal.z();
+  ++ground_count_;
+}
+
+std::optional<double> TreeMappingStage::GroundHeight() const {
+  constexpr int kMinScans = 10;
+  if (ground_count_ < kMinScans || model_.trees.size() != 1) return std::nullopt;
+  return ground_z_sum_m_ / ground_count_;
 }
 
 MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& config) {
@@ -132,7 +156,7 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   files.trajectory = mapper_.Trajectory();
   const std::int64_t stamp_ns =
       files.trajectory.empty() ? model_.stamp_ns : files.trajectory.back().stamp_ns;
-  model_ = topology_.Build(mapper_.Landmarks(), stamp_ns);
+  model_ = topology_.Build(mapper_.Landmarks(), stamp_ns, GroundHeight());
   files.model = model_;
   files.landmarks = mapper_.AllLandmarks();
   files.snapshot = mapper_.Snapshot();
@@ -147,6 +171,8 @@ void TreeMappingStage::Load(const MapFiles& files) {
   loaded.Load(files.snapshot);
   mapper_ = std::move(loaded);
   topology_.Restore(files.topology);
+  ground_z_sum_m_ = 0.0;
+  ground_count_ = 0;
   model_ = topology_.Build(mapper_.Landmarks(), files.model.stamp_ns);
 }
 
@@ -154,6 +180,8 @@ void TreeMappingStage::Reset() {
   mapper_.Reset();
   topology_.Reset();
   model_ = TreeModel();
+  ground_z_sum_m_ = 0.0;
+  ground_count_ = 0;
 }
 
 Pipeline::Pipeline(const PipelineConfig& config)
@@ -181,6 +209,7 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
   result.segments = separator_.Separate(result.scan);
   timer_.Add("branch_separation", stage.Lap());
   result.cylinders = fitter_.Fit(result.scan, result.segments);
+  const std::optional<GroundPlane> ground = FitGroundPlane(result.scan);
   timer_.Add("cylinder_fitting", stage.Lap());
   result.icp = icp_.AddScan(result.scan, std::nullopt);
   timer_.Add("icp", stage.Lap());
@@ -194,7 +223,7 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
     result.had_odometry = true;
   }
   stage.Lap();
-  result.mapping = mapping_.Process(input);
+  result.mapping = mapping_.Process(input, ground);
   timer_.Add("mapping", stage.Lap());
   timer_.Add("total", total.Lap());
   return result;

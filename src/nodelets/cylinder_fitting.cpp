@@ -69,7 +69,8 @@ class CylinderFitting : public nodelet::Nodelet {
       const std::vector<dendro::Segment> segments = FromMsg(segments_msg, scan.image.size());
       const std::vector<dendro::FittedCylinder> cylinders = fitter_->Fit(scan, segments);
       const std::int64_t stamp_ns = scan.image.stamp_ns;
-      cylinders_.publish(ToMsg(cylinders, stamp_ns, scan_msg.header.frame_id));
+      cylinders_.publish(ToMsg(
+          cylinders, stamp_ns, scan_msg.header.frame_id, dendro::FitGroundPlane(scan)));
       double measured = 0;
       for (const auto& fit : cylinders) measured += fit.status == dendro::FitStatus::kMeasured;
       diagnostics_->Show("cylinders measured", measured);

@@ -164,7 +164,7 @@ class TreeMapping : public nodelet::Nodelet {
     std::optional<Eigen::Isometry3d> T_odom_body;
     if (gate_->poses() != nullptr) T_odom_body = gate_->poses()->Lookup(input.stamp_ns);
     if (T_odom_body) input.T_odom_lidar = *T_odom_body * gate_->T_body_lidar();
-    const dendro::MapperResult result = stage_->Process(input);
+    const dendro::MapperResult result = stage_->Process(input, GroundFromMsg(*scan.cylinders));
     diagnostics_->Processed(input.stamp_ns, watch.Seconds());
     if (!result.warning.empty()) NODELET_WARN_THROTTLE(5.0, "%s", result.warning.c_str());
     // WoodSegmentation needs the same transform and says on the console what is missing.

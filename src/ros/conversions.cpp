@@ -435,8 +435,16 @@ std::vector<dendro::Segment> FromMsg(const dendro_slam::Segments& segments, std:
 
 dendro_slam::ScanCylindersPtr ToMsg(const std::vector<dendro::FittedCylinder>& cylinders,
                                     std::int64_t stamp_ns,
-                                    const std::string& frame_id) {
+                                    const std::string& frame_id,
+                                    const std::optional<dendro::GroundPlane>& ground) {
   auto msg = boost::make_shared<dendro_slam::ScanCylinders>();
+  if (ground) {
+    msg->has_ground = true;
+    msg->ground_normal.x = ground->normal.x();
+    msg->ground_normal.y = ground->normal.y();
+    msg->ground_normal.z = ground->normal.z();
+    msg->ground_offset = ground->offset;
+  }
   msg->header.stamp = ToRosTime(stamp_ns);
   msg->header.frame_id = frame_id;
   msg->cylinders.reserve(cylinders.size());
@@ -470,6 +478,20 @@ dendro_slam::ScanCylindersPtr ToMsg(const std::vector<dendro::FittedCylinder>& c
     msg->cylinders.push_back(out);
   }
   return msg;
+}
+
+std::optional<dendro::GroundPlane> GroundFromMsg(const dendro_slam::ScanCylinders& cylinders) {
+  if (!cylinders.has_ground) return std::nullopt;
+  dendro::GroundPlane ground;
+  ground.normal = Eigen::Vector3d(cylinders.ground_normal.x,
+                                  cylinders.ground_normal.y,
+                                  cylinders.ground_normal.z)
+                      .cast<float>();
+  ground.offset = static_cast<float>(cylinders.ground_offset);
+  if (!ground.normal.allFinite() || !std::isfinite(ground.offset)) {
+    throw std::invalid_argument("the ground of the scan is not finite");
+  }
+  return ground;
 }
 
 std::vector<dendro::FittedCylinder> FromMsg(const dendro_slam::ScanCylinders& cylinders) {

@@ -186,4 +186,35 @@ std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
   return EstimateWithin(image, config, static_cast<float>(config.far_range_m));
 }
 
+std::optional<GroundPlane> FitGroundPlane(const LabelledScan& scan, double max_range_m) {
+  constexpr int kMinReturns = 100;
+  constexpr double kMaxScatter = 0.15;   // [m]
+  constexpr double kMinExtent = 0.5;     // Across the narrower direction, standard deviation [m].
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  Eigen::Matrix3d squares = Eigen::Matrix3d::Zero();
+  int count = 0;
+  for (std::size_t i = 0; i < scan.image.size(); ++i) {
+    if (scan.label[i] != Label::kGround || !(scan.image.range[i] <= max_range_m)) continue;
+    const Eigen::Vector3d p = scan.image.point[i].cast<double>();
+    sum += p;
+    squares += p * p.transpose();
+    ++count;
+  }
+  if (count < kMinReturns) return std::nullopt;
+  const Eigen::Vector3d mean = sum / count;
+  const Eigen::Matrix3d covariance = squares / count - mean * mean.transpose();
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen(covariance);
+  const Eigen::Vector3d variance = eigen.eigenvalues();
+  if (!(variance[0] <= kMaxScatter * kMaxScatter) || !(variance[1] >= kMinExtent * kMinExtent)) {
+    return std::nullopt;
+  }
+  Eigen::Vector3d normal = eigen.eigenvectors().col(0);
+  if (normal.dot(mean) > 0.0) normal = -normal;  // Up is where the sensor is.
+  GroundPlane plane;
+  plane.normal = normal.cast<float>();
+  plane.offset = static_cast<float>(-normal.dot(mean));
+  if (!(plane.offset > 0.1F)) return std::nullopt;
+  return plane;
+}
+
 }  // namespace dendro

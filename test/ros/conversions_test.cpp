@@ -201,6 +201,20 @@ TEST(Segments, RoundTripAndRefusePixelsOutside) {
   EXPECT_THROW(FromMsg(*msg, 5), std::invalid_argument);
 }
 
+TEST(ScanCylinders, GroundRoundTrip) {
+  EXPECT_FALSE(GroundFromMsg(*ToMsg(std::vector<dendro::FittedCylinder>{}, 5, "velodyne")));
+  dendro::GroundPlane ground;
+  ground.normal = Eigen::Vector3f(0.1F, -0.2F, 0.97F).normalized();
+  ground.offset = 1.4F;
+  const auto msg = ToMsg(std::vector<dendro::FittedCylinder>{}, 5, "velodyne", ground);
+  const auto back = GroundFromMsg(*msg);
+  ASSERT_TRUE(back.has_value());
+  EXPECT_EQ(back->normal, ground.normal);
+  EXPECT_EQ(back->offset, ground.offset);
+  msg->ground_offset = NAN;
+  EXPECT_THROW(GroundFromMsg(*msg), std::invalid_argument);
+}
+
 TEST(ScanCylinders, RoundTrip) {
   dendro::FittedCylinder fit;
   fit.segment_id = 3;

@@ -44,6 +44,26 @@ TEST(GroundPlane, SaysNothingWithoutGround) {
   EXPECT_FALSE(EstimateGroundPlane(test::EmptyImage(16, 1800), GroundPlaneConfig()).has_value());
 }
 
+TEST(GroundPlane, FitThroughLabelledReturnsInAnyAttitude) {
+  for (const double roll_deg : {0.0, 20.0, 90.0}) {
+    const Eigen::Matrix3d rotation =
+        Eigen::AngleAxisd(roll_deg * M_PI / 180.0, Eigen::Vector3d::UnitX()).toRotationMatrix();
+    const test::SyntheticScan synthetic = test::MakeScan(kStems, 1.7, 0.01, 5, rotation);
+    LabelledScan scan;
+    scan.image = synthetic.image;
+    scan.label = synthetic.truth;
+    const auto ground = FitGroundPlane(scan);
+    ASSERT_TRUE(ground.has_value()) << roll_deg;
+    EXPECT_NEAR(ground->offset, 1.7, 0.005) << roll_deg;
+    const Eigen::Vector3d up = rotation.transpose() * Eigen::Vector3d::UnitZ();
+    EXPECT_GT(ground->normal.cast<double>().dot(up), 0.99999) << roll_deg;
+    for (Label& label : scan.label) {
+      if (label == Label::kGround) label = Label::kOther;
+    }
+    EXPECT_FALSE(FitGroundPlane(scan).has_value());
+  }
+}
+
 TEST(GeometricWood, BareStemsOnAPlane) {
   WoodSegmenterConfig config;
   config.method = "geometric";

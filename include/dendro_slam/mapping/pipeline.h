@@ -16,6 +16,7 @@
 #include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/odometry/wood_icp.h"
 #include "dendro_slam/range_image/projector.h"
+#include "dendro_slam/segmentation/ground_plane.h"
 #include "dendro_slam/segmentation/wood_segmenter.h"
 #include "dendro_slam/sensors/pose_buffer.h"
 #include "dendro_slam/topology/tree_topology.h"
@@ -112,7 +113,10 @@ class TreeMappingStage {
   explicit TreeMappingStage(const TreeMappingConfig& config);
 
   /// Takes one scan; at key frames the model is built anew.
-  MapperResult Process(const MapperInput& input);
+  /// @param ground  The ground in the lidar frame, where the scan shows it (FitGroundPlane). A map
+  ///                of one tree then stands on the mean of what was seen; with several trees or
+  ///                without it, the base is the lowest wood seen.
+  MapperResult Process(const MapperInput& input, const std::optional<GroundPlane>& ground);
 
   /// The map at the last key frame. Landmarks between key frames change in their extents and radii
   /// only; Files() has them.
@@ -130,9 +134,15 @@ class TreeMappingStage {
 
  private:
   TreeMappingConfig config_;
+  /// Height of the ground below the only tree of the map [m], if seen.
+  std::optional<double> GroundHeight() const;
+  void AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar);
+
   Mapper mapper_;
   TreeTopology topology_;
   TreeModel model_;
+  double ground_z_sum_m_ = 0.0;
+  int ground_count_ = 0;
 };
 
 /// Result of one scan through all stages.

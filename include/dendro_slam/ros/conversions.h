@@ -15,6 +15,7 @@
 
 #include "dendro_slam/GraphStatus.h"
 #include "dendro_slam/ScanCylinders.h"
+#include "dendro_slam/segmentation/ground_plane.h"
 #include "dendro_slam/Segments.h"
 #include "dendro_slam/TreeMap.h"
 #include "dendro_slam/branch_separation/segment.h"
@@ -107,9 +108,13 @@ dendro_slam::SegmentsPtr ToMsg(const std::vector<dendro::Segment>& segments,
 /// @throws std::invalid_argument  A pixel outside the scan.
 std::vector<dendro::Segment> FromMsg(const dendro_slam::Segments& segments, std::size_t num_pixels);
 
+/// @param ground  The ground in the lidar frame, if the scan shows it.
 dendro_slam::ScanCylindersPtr ToMsg(const std::vector<dendro::FittedCylinder>& cylinders,
                                     std::int64_t stamp_ns,
-                                    const std::string& frame_id);
+                                    const std::string& frame_id,
+                                    const std::optional<dendro::GroundPlane>& ground = std::nullopt);
+/// @throws std::invalid_argument  A value that is not finite.
+std::optional<dendro::GroundPlane> GroundFromMsg(const dendro_slam::ScanCylinders& cylinders);
 /// @throws std::invalid_argument  A value that is not finite, or an unknown status.
 std::vector<dendro::FittedCylinder> FromMsg(const dendro_slam::ScanCylinders& cylinders);
 
