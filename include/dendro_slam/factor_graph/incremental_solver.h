@@ -62,7 +62,8 @@ struct UpdateOptions {
 
 struct UpdateResult {
   double error_before = 0.0;        ///< 1/2 chi2 of the new graph at the old estimate and the new values.
-  double error_after = 0.0;         ///< 1/2 chi2 of the new graph at the new estimate; never above error_before.
+  double error_after = 0.0;         ///< 1/2 chi2 of the new graph at the new estimate; above error_before
+                                    ///< by rounding at most (1e-13 relative plus 1e-12).
   double damping = 0.0;             ///< Levenberg-Marquardt lambda of the last accepted step; 0 is Gauss-Newton.
   int variables_relinearized = 0;
   int variables_reeliminated = 0;
