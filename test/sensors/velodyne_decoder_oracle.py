@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Every return that the `velodyne-decoder` wheel (PyPI) finds in a capture, ours must hold too.
+"""Every return that the `velodyne-decoder` wheel finds in a capture, ours must hold too.
 
 usage: velodyne_decoder_oracle.py VLP16_DUMP FOLDER_OF_CAPTURES
 Exits with 77 (skipped) when the wheel or the captures are missing.
@@ -9,6 +9,9 @@ import struct
 import subprocess
 import sys
 import tempfile
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+import oracles
 
 CAPTURES = ["grap_apple_20frames.pcap", "veloview_vlp16_90deg_50frames.pcap",
             "mrpt_vlp16_gps.pcap"]
@@ -33,11 +36,10 @@ def with_factory_byte(capture, out):
 
 def main():
     dump, folder = sys.argv[1], pathlib.Path(sys.argv[2])
-    try:
-        import numpy as np
-        import velodyne_decoder as vd
-    except ImportError as error:
-        skip(f"{error}; to run this comparison: pip install velodyne-decoder")
+    vd, reason = oracles.find("velodyne_decoder")
+    if vd is None:
+        skip(reason)
+    import numpy as np
     captures = [folder / name for name in CAPTURES if (folder / name).exists()]
     if not captures:
         skip(f"no captures in {folder}")
