@@ -16,7 +16,8 @@ enum Stream : int {
   kWalkX, kWalkY, kWalkZ, kWalkYaw,
   kSlowX, kSlowY, kSlowZ, kSlowRoll, kSlowPitch, kSlowYaw,
   kNoiseX, kNoiseY, kNoiseZ, kNoiseRoll, kNoisePitch, kNoiseYaw,
-  kJump, kJumpX, kJumpY, kJumpZ, kJumpYaw, kLoss
+  kJump, kJumpX, kJumpY, kJumpZ, kJumpYaw, kLoss,
+  kDriftX, kDriftY, kDriftZ, kOneJump
 };
 
 Eigen::Matrix3d RotationZ(double angle) {
@@ -45,6 +46,7 @@ void OdometrySimulatorConfig::Validate() const {
     }
   });
   if (!(tilt_time_s > 0.0)) throw std::invalid_argument("odometry.tilt_time_s: expected > 0");
+  if (!(drift_length_m > 0.0)) throw std::invalid_argument("odometry.drift_length_m: expected > 0");
   if (!(mavros_correlation_s > 0.0)) {
     throw std::invalid_argument("odometry.mavros_correlation_s: expected > 0");
   }
@@ -59,6 +61,8 @@ OdometrySimulator::OdometrySimulator(const Trajectory& trajectory,
   if (config_.model == "t265") {
     const Eigen::Matrix3d R = T_map_base_previous_.linear();
     T_odom_base_.linear() = RotationZ(-std::atan2(R(1, 0), R(0, 0))) * R;
+    drift_ = config_.drift_m_per_m *
+             Eigen::Vector3d(Gauss(-1, kDriftX), Gauss(-1, kDriftY), Gauss(-1, kDriftZ));
   } else {
     T_odom_base_ = T_map_base_previous_;
     slow_position_ = config_.mavros_position_sigma_m * Eigen::Vector3d(Gauss(-1, kSlowX), Gauss(-1, kSlowY), Gauss(-1, kSlowZ));
@@ -82,6 +86,11 @@ std::vector<OdometrySample> OdometrySimulator::AdvanceTo(double until_s) {
                       static_cast<std::uint64_t>(stream) + 1000)
         .Uniform();
   };
+  // True for the first message at or after a time; never for 0.
+  const auto reached = [&](double at_s, std::int64_t index) {
+    const double now = static_cast<double>(index) * dt;
+    return at_s > 0.0 && now >= at_s && now - dt < at_s;
+  };
   while (static_cast<double>(next_index_) * dt <= until_s + 1e-9) {
     const std::int64_t i = next_index_++;
     const double time_s = static_cast<double>(i) * dt;
@@ -94,11 +103,18 @@ std::vector<OdometrySample> OdometrySimulator::AdvanceTo(double until_s) {
     if (t265) {
       const Eigen::Isometry3d step = T_map_base_previous_.inverse() * T_map_base;
       const double distance = step.translation().norm();
+      if (reached(config_.loss_time_s, i)) lost_until_s_ = time_s + config_.loss_duration_s;
       lost = time_s < lost_until_s_;
-      const double walk = config_.position_walk_m_per_sqrt_m * std::sqrt(distance) * (lost ? 10.0 : 1.0);
+      const double worse = lost ? 10.0 : 1.0;
+      const double drift_keep = std::exp(-distance / config_.drift_length_m);
+      drift_ = drift_keep * drift_ +
+               std::sqrt(1.0 - drift_keep * drift_keep) * config_.drift_m_per_m *
+                   Eigen::Vector3d(Gauss(i, kDriftX), Gauss(i, kDriftY), Gauss(i, kDriftZ));
+      const double walk = config_.position_walk_m_per_sqrt_m * std::sqrt(distance);
       T_odom_base_.translation() +=
           T_odom_base_.linear() * ((1.0 + config_.scale_error) * step.translation()) +
-          walk * Eigen::Vector3d(Gauss(i, kWalkX), Gauss(i, kWalkY), Gauss(i, kWalkZ));
+          worse * (distance * drift_ +
+                   walk * Eigen::Vector3d(Gauss(i, kWalkX), Gauss(i, kWalkY), Gauss(i, kWalkZ)));
       const double yaw_step =
           config_.yaw_walk_deg_per_sqrt_m * kDegree * std::sqrt(distance) * Gauss(i, kWalkYaw);
       T_odom_base_.linear() = RotationZ(yaw_step) * T_odom_base_.linear() * step.linear();
@@ -107,6 +123,11 @@ std::vector<OdometrySample> OdometrySimulator::AdvanceTo(double until_s) {
                                       Eigen::Vector3d(Gauss(i, kJumpX), Gauss(i, kJumpY), Gauss(i, kJumpZ));
         T_odom_base_.linear() =
             RotationZ(config_.jump_yaw_deg * kDegree * Gauss(i, kJumpYaw)) * T_odom_base_.linear();
+      }
+      if (reached(config_.jump_time_s, i)) {
+        const double direction = 2.0 * M_PI * uniform(0, kOneJump);
+        T_odom_base_.translation() +=
+            config_.jump_distance_m * Eigen::Vector3d(std::cos(direction), std::sin(direction), 0.0);
       }
       if (!lost && config_.loss_interval_s > 0.0 && uniform(i, kLoss) < dt / config_.loss_interval_s) {
         lost_until_s_ = time_s + config_.loss_duration_s;

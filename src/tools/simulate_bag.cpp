@@ -15,6 +15,7 @@
 #include "dendro_slam/ros/bag.h"
 #include "dendro_slam/ros/conversions.h"
 #include "dendro_slam/ros/packet_scans.h"
+#include "dendro_slam/ros/params.h"
 #include "dendro_slam/ros/point_cloud2.h"
 #include "dendro_slam/ros/progress.h"
 #include "dendro_slam/ros/rig_messages.h"
@@ -33,12 +34,38 @@ struct Options {
   std::string pcap;
   double duration_s = 0.0;
   int threads = 0;
+  std::vector<std::string> set;
 };
 
 std::string TruthFolder(const std::string& bag) {
   std::filesystem::path path(bag);
   path.replace_extension(".truth");
   return path.string();
+}
+
+/// Applies `--set SECTION.KEY=VALUE`, one at a time.
+/// @throws ParamError  Names the option, what is unknown and what there is.
+void ApplySettings(const std::vector<std::string>& settings,
+                   dendro::LidarSimulatorConfig* lidar,
+                   dendro::OdometrySimulatorConfig* odometry) {
+  for (const std::string& text : settings) {
+    const std::string where = "--set " + text;
+    const std::size_t dot = text.find('.');
+    const std::size_t equal = text.find('=');
+    if (dot == std::string::npos || equal == std::string::npos || dot > equal) {
+      throw dendro_ros::ParamError(where + ": expected SECTION.KEY=VALUE, e.g. odometry.jump_time_s=60");
+    }
+    const std::string section = text.substr(0, dot);
+    const dendro_ros::ParamTree tree = dendro_ros::ParseYaml(
+        text.substr(dot + 1, equal - dot - 1) + ": " + text.substr(equal + 1), where);
+    if (section == "lidar") {
+      dendro_ros::UpdateConfig(tree, where, lidar);
+    } else if (section == "odometry") {
+      dendro_ros::UpdateConfig(tree, where, odometry);
+    } else {
+      throw dendro_ros::ParamError(where + ": expected the section lidar or odometry");
+    }
+  }
 }
 
 void Run(const Options& options) {
@@ -51,6 +78,7 @@ void Run(const Options& options) {
     lidar.seed = *options.seed;
     path.odometry.seed = *options.seed;
   }
+  ApplySettings(options.set, &lidar, &path.odometry);
   if (options.duration_s > 0.0) path.duration_s = std::min(path.duration_s, options.duration_s);
 
   const dendro::Raycaster raycaster(scene);
@@ -148,6 +176,12 @@ int main(int argc, char** argv) {
       ->check(CLI::PositiveNumber);
   app.add_option("--threads", options.threads, "threads; the result does not depend on it")
       ->check(CLI::PositiveNumber);
+  app.add_option("--set",
+                 options.set,
+                 "SECTION.KEY=VALUE: a parameter of the sensor (lidar) or the odometry instead of the "
+                 "path's or the default, e.g. lidar.return_mode=dual odometry.jump_time_s=60 "
+                 "odometry.loss_time_s=60; all of them in doc/parameters.md, LidarSimulatorConfig and "
+                 "OdometrySimulatorConfig");
   CLI11_PARSE(app, argc, argv);
   try {
     Run(options);

@@ -1,6 +1,8 @@
 #include "dendro_slam/sim/flight_path.h"
 
+#include <array>
 #include <cmath>
+#include <cstdio>
 #include <filesystem>
 #include <fstream>
 
@@ -186,7 +188,7 @@ class Odometry : public ::testing::Test {
       using T = std::decay_t<decltype(value)>;
       const std::string key = name;
       if constexpr (std::is_same_v<T, double>) {
-        if (key != "rate_hz" && key != "tilt_time_s" && key != "mavros_correlation_s") value = 0.0;
+        if (key != "rate_hz" && key != "tilt_time_s" && key != "drift_length_m" && key != "mavros_correlation_s") value = 0.0;
       }
     });
     return config;
@@ -219,25 +221,52 @@ TEST_F(Odometry, TheScaleErrorStretchesTheWay) {
   EXPECT_TRUE(measured.isApprox(1.02 * truth, 1e-6));
 }
 
-TEST_F(Odometry, TheDefaultDriftIsBelowOnePercentOfTheWay) {
-  const double distance = Distance();
-  double square = 0.0;
-  constexpr int kSeeds = 24;
+// The thesis' flight over many seeds: error of the relative translation over pieces of way, and of the
+// place at the end, both over the way travelled.
+TEST_F(Odometry, TheDefaultDriftOfTheThesisFlightIsAboutOnePercentOfTheWay) {
+  const FlightPath path =
+      LoadFlightPath(std::string(DENDRO_SOURCE_DIR) + "/config/paths/thesis_quadrangle.yaml");
+  constexpr int kSeeds = 40;
+  constexpr std::array<double, 4> kPiecesM = {10.0, 20.0, 40.0, 80.0};
+  std::array<double, 4> square{}, count{};
+  double end_square = 0.0, distance = 0.0;
   for (int seed = 1; seed <= kSeeds; ++seed) {
-    OdometrySimulatorConfig config;
+    OdometrySimulatorConfig config = path.odometry;
+    config.rate_hz = 20.0;
     config.seed = seed;
-    const auto samples = Simulate(config);
-    const Eigen::Isometry3d T_map_odom = Truth(samples[0]) * samples[0].T_odom_base.inverse();
-    double worst = 0.0;
-    for (std::size_t i = 0; i < samples.size(); i += 20) {
-      worst = std::max(worst, ((T_map_odom * samples[i].T_odom_base).translation() - Truth(samples[i]).translation()).norm());
+    const auto samples = SimulateOdometry(path.trajectory, path.duration_s, path.start_stamp_ns, config);
+    std::vector<Eigen::Isometry3d> truth;
+    std::vector<double> way = {0.0};
+    for (const OdometrySample& s : samples) {
+      truth.push_back(path.trajectory.Pose(static_cast<double>(s.stamp_ns - path.start_stamp_ns) * 1e-9));
+      if (truth.size() > 1) {
+        way.push_back(way.back() + (truth.back().translation() - truth[truth.size() - 2].translation()).norm());
+      }
     }
-    square += worst * worst / kSeeds;
+    distance = way.back();
+    for (std::size_t k = 0; k < kPiecesM.size(); ++k) {
+      for (std::size_t i = 0; i < samples.size(); i += 40) {
+        const auto j = static_cast<std::size_t>(
+            std::lower_bound(way.begin(), way.end(), way[i] + kPiecesM[k]) - way.begin());
+        if (j >= samples.size()) break;
+        const Eigen::Isometry3d error = (truth[i].inverse() * truth[j]).inverse() *
+                                        (samples[i].T_odom_base.inverse() * samples[j].T_odom_base);
+        square[k] += std::pow(error.translation().norm() / kPiecesM[k], 2);
+        count[k] += 1.0;
+      }
+    }
+    const Eigen::Vector3d end =
+        (truth[0] * samples[0].T_odom_base.inverse() * samples.back().T_odom_base).translation();
+    end_square += std::pow((end - truth.back().translation()).norm() / distance, 2) / kSeeds;
   }
-  const double ratio = std::sqrt(square) / distance;
-  RecordProperty("drift_ratio_permille", static_cast<int>(1000 * ratio));
-  EXPECT_GT(ratio, 0.0015);
-  EXPECT_LT(ratio, 0.01);
+  EXPECT_NEAR(distance, 159.0, 1.0);  // Rounded corners are shorter than 5 laps of 32 m.
+  for (std::size_t k = 0; k < kPiecesM.size(); ++k) {
+    const double ratio = std::sqrt(square[k] / count[k]);
+    std::printf("pieces of %2.0f m: %.2f %% of the way\n", kPiecesM[k], 100.0 * ratio);
+    EXPECT_NEAR(ratio, 0.010, 0.003) << kPiecesM[k];
+  }
+  std::printf("at the end of %.0f m: %.2f %% of the way\n", distance, 100.0 * std::sqrt(end_square));
+  EXPECT_NEAR(std::sqrt(end_square), 0.010, 0.004);
 }
 
 TEST_F(Odometry, CovarianceIsTheDriversAndDoesNotTellTheDrift) {
@@ -280,6 +309,35 @@ TEST_F(Odometry, JumpsAndLossesHappenWhenAskedFor) {
   }
   EXPECT_GT(jumps, 2);
   EXPECT_GT(gaps, 1);
+}
+
+TEST_F(Odometry, OneJumpAndOneLossHappenWhenTheyShould) {
+  OdometrySimulatorConfig config = Perfect();
+  config.jump_time_s = 12.0;
+  config.jump_distance_m = 0.5;
+  config.loss_time_s = 30.0;
+  config.loss_duration_s = 5.0;
+  const auto samples = Simulate(config);
+  int jumps = 0, gaps = 0;
+  for (std::size_t i = 1; i < samples.size(); ++i) {
+    const double time_s = static_cast<double>(samples[i].stamp_ns - path_.start_stamp_ns) * 1e-9;
+    const double dt = static_cast<double>(samples[i].stamp_ns - samples[i - 1].stamp_ns) * 1e-9;
+    const Eigen::Isometry3d moved = samples[i - 1].T_odom_base.inverse() * samples[i].T_odom_base;
+    const Eigen::Isometry3d really = Truth(samples[i - 1]).inverse() * Truth(samples[i]);
+    const double off = (moved.translation() - really.translation()).norm();
+    if (off > 0.01) {
+      ++jumps;
+      EXPECT_NEAR(time_s, 12.0, 0.006);
+      EXPECT_NEAR(off, 0.5, 1e-9);
+    }
+    if (dt > 0.006) {
+      ++gaps;
+      EXPECT_NEAR(time_s, 35.0, 0.006);
+      EXPECT_NEAR(dt, 5.0, 0.006);
+    }
+  }
+  EXPECT_EQ(jumps, 1);
+  EXPECT_EQ(gaps, 1);
 }
 
 TEST_F(Odometry, PiecesMakeTheWholeAndSeedsDiffer) {

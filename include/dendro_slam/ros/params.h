@@ -58,6 +58,10 @@ std::vector<std::string> ConfigKeys();
 template <class Config>
 Config ReadConfig(const ParamTree& tree, const std::string& where);
 
+/// As ReadConfig, but keys that the tree does not hold keep the value they have.
+template <class Config>
+void UpdateConfig(const ParamTree& tree, const std::string& where, Config* config);
+
 namespace internal {
 
 template <class T, class = void>
@@ -152,6 +156,11 @@ Config ReadConfig(const ParamTree& tree, const std::string& where) {
   Config config;
   internal::ReadInto(tree, where, config);
   return config;
+}
+
+template <class Config>
+void UpdateConfig(const ParamTree& tree, const std::string& where, Config* config) {
+  internal::ReadInto(tree, where, *config);
 }
 
 }  // namespace dendro_ros
