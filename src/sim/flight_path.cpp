@@ -127,7 +127,7 @@ Eigen::Vector2d ReadCentre(const YamlMap& map) {
 
 /// Keys that every type has.
 const std::vector<std::string> kCommonKeys = {"type",       "duration_s", "start_stamp_s",
-                                              "extrinsics", "odometry"};
+                                              "extrinsics", "odometry",   "origin"};
 /// Keys of every type that is made here (all but poses).
 const std::vector<std::string> kMotionKeys = {"speed_mps", "look_at", "yaw",     "hover_s",
                                               "corner_s",  "wobble"};
@@ -205,6 +205,30 @@ std::vector<TimedPose> ReadTum(const YamlMap& map, const std::string& path) {
 
 Eigen::Isometry3d FlightPath::LidarPose(std::int64_t stamp_ns) const {
   return trajectory.Pose(static_cast<double>(stamp_ns - start_stamp_ns) * 1e-9) * T_base_lidar;
+}
+
+GnssFix FlightPath::Fix(std::int64_t stamp_ns) const {
+  constexpr std::int64_t kSecondNs = 1000000000;
+  GnssFix fix;
+  fix.stamp_ns = stamp_ns / kSecondNs * kSecondNs;
+  fix.utc_ns = fix.stamp_ns;
+  fix.valid = true;
+  const double time_s = static_cast<double>(fix.stamp_ns - start_stamp_ns) * 1e-9;
+  const Eigen::Isometry3d T_map_base = trajectory.Pose(time_s);
+  const Eigen::Vector3d velocity = T_map_base.linear() * trajectory.Twist(time_s).tail<3>();
+  // Radii of curvature of the WGS 84 ellipsoid along the meridian and across it.
+  constexpr double kSemiMajorM = 6378137.0, kFlattening = 1.0 / 298.257223563;
+  constexpr double kEccentricity2 = kFlattening * (2.0 - kFlattening);
+  const double latitude = origin_latitude_deg * kDegree;
+  const double w2 = 1.0 - kEccentricity2 * std::pow(std::sin(latitude), 2);
+  const double meridian_m = kSemiMajorM * (1.0 - kEccentricity2) / (w2 * std::sqrt(w2));
+  const double normal_m = kSemiMajorM / std::sqrt(w2);
+  const Eigen::Vector3d p = T_map_base.translation();
+  fix.latitude_deg = origin_latitude_deg + p.y() / meridian_m / kDegree;
+  fix.longitude_deg = origin_longitude_deg + p.x() / (normal_m * std::cos(latitude)) / kDegree;
+  fix.speed_mps = velocity.head<2>().norm();
+  fix.course_deg = fix.speed_mps > 1e-6 ? std::atan2(velocity.x(), velocity.y()) / kDegree : 0.0;
+  return fix;
 }
 
 FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
@@ -376,6 +400,14 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
     e.AllowOnly({"base_to_lidar", "base_to_camera"});
     if (e.Has("base_to_lidar")) path.T_base_lidar = ReadTransform(e.Map("base_to_lidar"));
     if (e.Has("base_to_camera")) path.T_base_camera = ReadTransform(e.Map("base_to_camera"));
+  }
+  if (map.Has("origin")) {
+    const YamlMap o = map.Map("origin");
+    o.AllowOnly({"latitude_deg", "longitude_deg"});
+    path.origin_latitude_deg = o.Number("latitude_deg");
+    path.origin_longitude_deg = o.Number("longitude_deg");
+    if (std::abs(path.origin_latitude_deg) > 89.0) o.Fail("latitude_deg", "expected -89 to 89 [deg]");
+    if (std::abs(path.origin_longitude_deg) > 180.0) o.Fail("longitude_deg", "expected -180 to 180 [deg]");
   }
   if (map.Has("odometry")) {
     const YamlMap o = map.Map("odometry");

@@ -2,7 +2,6 @@
 
 #include <CLI/CLI.hpp>
 #include <fmt/format.h>
-#include <sensor_msgs/NavSatFix.h>
 
 #include <algorithm>
 #include <string>
@@ -10,6 +9,7 @@
 
 #include "dendro_slam/ros/bag.h"
 #include "dendro_slam/ros/conversions.h"
+#include "dendro_slam/ros/packet_scans.h"
 #include "dendro_slam/ros/point_cloud2.h"
 #include "dendro_slam/ros/velodyne_msgs.h"
 #include "dendro_slam/sensors/capture_reader.h"
@@ -23,18 +23,6 @@ struct Options {
   dendro::CaptureReaderConfig capture;
   dendro::ScanAssemblerConfig assembler;
 };
-
-sensor_msgs::NavSatFix ToFixMsg(const dendro::GnssFix& fix) {
-  sensor_msgs::NavSatFix msg;
-  msg.header.stamp = dendro_ros::ToRosTime(fix.stamp_ns);
-  msg.header.frame_id = "gps";
-  msg.status.status =
-      fix.valid ? sensor_msgs::NavSatStatus::STATUS_FIX : sensor_msgs::NavSatStatus::STATUS_NO_FIX;
-  msg.status.service = sensor_msgs::NavSatStatus::SERVICE_GPS;
-  msg.latitude = fix.latitude_deg;
-  msg.longitude = fix.longitude_deg;
-  return msg;
-}
 
 void Run(const Options& options) {
   dendro::CaptureReader reader(
@@ -59,7 +47,7 @@ void Run(const Options& options) {
       packets.packets.push_back(packet);
     }
     if (step.fix) {
-      bag.Write("/fix", dendro_ros::ToRosTime(bag_ns), ToFixMsg(*step.fix));
+      bag.Write("/fix", dendro_ros::ToRosTime(bag_ns), dendro_ros::ToFixMsg(*step.fix));
       ++num_fixes;
     }
     for (const dendro::LidarScan& scan : step.scans) {

@@ -94,7 +94,7 @@ void Run(const Options& options) {
   std::optional<dendro_ros::PacketScans> packets;
   std::optional<dendro::PcapWriter> pcap;
   if (options.packets || !options.pcap.empty()) {
-    packets.emplace(lidar.return_mode, RigMessages::kLidarFrame);
+    packets.emplace(lidar.return_mode, RigMessages::kLidarFrame, path);
   }
   if (!options.pcap.empty()) pcap.emplace(options.pcap);
 
@@ -120,6 +120,7 @@ void Run(const Options& options) {
                           ? options.threads
                           : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
   std::size_t points = 0;
+  std::int64_t last_fix_ns = -1;
   dendro_ros::Progress progress("simulating");
   dendro::SimulateFlight(
       simulator, path, threads, [&](int index, const dendro::SimulatedScan& scan) {
@@ -129,8 +130,18 @@ void Run(const Options& options) {
         }
         const ros::Time end = dendro_ros::ToRosTime(end_ns);
         if (packets) {
-          const auto message = packets->Add(scan);
-          if (options.packets) bag.Write(RigMessages::kPacketsTopic, end, message);
+          const dendro_ros::RevolutionPackets message = packets->Add(scan);
+          if (options.packets) {
+            for (const dendro_ros::PositionPacketBytes& position : message.positions) {
+              bag.Write(RigMessages::kPositionPacketsTopic, position.stamp, dendro_ros::ToMsg(position));
+            }
+            bag.Write(RigMessages::kPacketsTopic, end, message.scan);
+            const dendro::GnssFix fix = path.Fix(end_ns);
+            if (fix.stamp_ns > last_fix_ns) {
+              bag.Write(RigMessages::kFixTopic, end, dendro_ros::ToFixMsg(fix));
+              last_fix_ns = fix.stamp_ns;
+            }
+          }
           if (pcap) dendro_ros::WritePackets(message, &*pcap);
         }
         bag.Write(RigMessages::kPointsTopic,
@@ -170,7 +181,7 @@ int main(int argc, char** argv) {
   app.add_option("--seed", options.seed, "seed of every random effect");
   app.add_option("--odometry", options.odometry, "odometry model instead of the path's")
       ->check(CLI::IsMember({"mavros", "t265", "none"}));
-  app.add_flag("--packets", options.packets, "also write /velodyne_packets");
+  app.add_flag("--packets", options.packets, "also write /velodyne_packets, /velodyne_position_packets and /fix");
   app.add_option("--pcap", options.pcap, "also write the packets as a capture");
   app.add_option("--duration", options.duration_s, "end the flight after this time [s]")
       ->check(CLI::PositiveNumber);

@@ -24,6 +24,8 @@ class RigMessages {
  public:
   static constexpr const char* kPointsTopic = "/velodyne_points";
   static constexpr const char* kPacketsTopic = "/velodyne_packets";
+  static constexpr const char* kPositionPacketsTopic = "/velodyne_position_packets";
+  static constexpr const char* kFixTopic = "/fix";
   static constexpr const char* kTruthLidarTopic = "/ground_truth/lidar_pose";
   static constexpr const char* kTruthLabelsTopic = "/ground_truth/labels";
   static constexpr const char* kTruthTreesTopic = "/ground_truth/tree_map";

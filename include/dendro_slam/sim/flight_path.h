@@ -7,6 +7,7 @@
 #include <Eigen/Geometry>
 
 #include "dendro_slam/geometry/se3.h"
+#include "dendro_slam/sensors/vlp16_packet.h"
 #include "dendro_slam/sim/odometry_simulator.h"
 
 namespace dendro {
@@ -52,9 +53,15 @@ struct FlightPath {
   Eigen::Isometry3d T_base_lidar = Eigen::Isometry3d::Identity();
   Eigen::Isometry3d T_base_camera = Eigen::Isometry3d::Identity();
   OdometrySimulatorConfig odometry;    ///< Model and drift.
+  double origin_latitude_deg = 33.4214;    ///< Of the map's origin, WGS 84; x points east, y north.
+  double origin_longitude_deg = -111.9324;
 
   /// T_map_lidar at a stamp [ns].
   Eigen::Isometry3d LidarPose(std::int64_t stamp_ns) const;
+
+  /// What a GNSS receiver without error reports at a stamp [ns]: the fix of the last full second. The
+  /// map's plane is laid on the ellipsoid at the origin by its two radii of curvature.
+  GnssFix Fix(std::int64_t stamp_ns) const;
 };
 
 /// Reads a flight-path file (YAML): `type` quadrangle, circle, helix, conical_helix, walk or poses.
