@@ -104,12 +104,29 @@ struct Serializer<dendro_ros::VelodynePacket> {
 
 template <>
 struct Serializer<dendro_ros::VelodyneScan> {
-  template <typename Stream, typename T>
-  static void allInOne(Stream& stream, T scan) {
+  /// @throws StreamOverrunException when the message is shorter than it says, before the memory of
+  ///         packets that cannot be there is asked for.
+  template <typename Stream>
+  static void read(Stream& stream, dendro_ros::VelodyneScan& scan) {
+    stream.next(scan.header);
+    std::uint32_t count = 0;
+    stream.next(count);
+    constexpr std::uint32_t kPacketBytes = 8 + 1206;
+    if (count > stream.getLength() / kPacketBytes) throwStreamOverrun();
+    scan.packets.resize(count);
+    for (dendro_ros::VelodynePacket& packet : scan.packets) stream.next(packet);
+  }
+  template <typename Stream>
+  static void write(Stream& stream, const dendro_ros::VelodyneScan& scan) {
     stream.next(scan.header);
     stream.next(scan.packets);
   }
-  ROS_DECLARE_ALLINONE_SERIALIZER
+  static std::uint32_t serializedLength(const dendro_ros::VelodyneScan& scan) {
+    LStream stream;
+    stream.next(scan.header);
+    stream.next(scan.packets);
+    return stream.getLength();
+  }
 };
 
 }  // namespace serialization

@@ -3,18 +3,17 @@
 #include <filesystem>
 #include <fstream>
 #include <iterator>
-#include <string>
 #include <vector>
 
 #include <gtest/gtest.h>
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size);
 
-// Inputs that fuzzing has found worth keeping; the target aborts when one of them goes wrong.
+// Inputs that fuzzing has found worth keeping, through the fuzz target this is linked with; the
+// target aborts when one of them goes wrong.
 TEST(FuzzCorpus, Replays) {
   std::vector<std::filesystem::path> files;
-  for (const auto& entry : std::filesystem::directory_iterator(
-           std::string(DENDRO_SOURCE_DIR) + "/test/sensors/fuzz_corpus")) {
+  for (const auto& entry : std::filesystem::directory_iterator(DENDRO_FUZZ_CORPUS)) {
     files.push_back(entry.path());
   }
   std::sort(files.begin(), files.end());
