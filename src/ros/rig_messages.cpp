@@ -80,6 +80,26 @@ tf2_msgs::TFMessage RigMessages::OdometryTransform(const dendro::OdometrySample&
   return msg;
 }
 
+sensor_msgs::Imu RigMessages::Imu(const dendro::ImuSample& sample, const dendro::ImuSimulatorConfig& config) {
+  sensor_msgs::Imu msg;
+  msg.header.stamp = ToRosTime(sample.stamp_ns);
+  msg.header.frame_id = kBaseFrame;
+  msg.orientation_covariance[0] = -1.0;  // No orientation (sensor_msgs/Imu).
+  msg.angular_velocity.x = sample.angular_velocity_rps.x();
+  msg.angular_velocity.y = sample.angular_velocity_rps.y();
+  msg.angular_velocity.z = sample.angular_velocity_rps.z();
+  msg.linear_acceleration.x = sample.specific_force_mps2.x();
+  msg.linear_acceleration.y = sample.specific_force_mps2.y();
+  msg.linear_acceleration.z = sample.specific_force_mps2.z();
+  const double gyro_variance = config.GyroSigmaRps() * config.GyroSigmaRps();
+  const double accel_variance = config.AccelSigmaMps2() * config.AccelSigmaMps2();
+  for (const std::size_t i : {0U, 4U, 8U}) {
+    msg.angular_velocity_covariance[i] = gyro_variance;
+    msg.linear_acceleration_covariance[i] = accel_variance;
+  }
+  return msg;
+}
+
 geometry_msgs::PoseStamped RigMessages::TruthLidarPose(const dendro::SimulatedScan& scan) {
   geometry_msgs::PoseStamped msg;
   msg.header.stamp = ToRosTime(scan.scan.stamp_ns);

@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <stdexcept>
+#include <utility>
 
 #include "counter_rng.h"
 #include "dendro_slam/geometry/so3.h"
@@ -55,9 +56,16 @@ void OdometrySimulatorConfig::Validate() const {
 OdometrySimulator::OdometrySimulator(const Trajectory& trajectory,
                                      std::int64_t start_stamp_ns,
                                      const OdometrySimulatorConfig& config)
-    : trajectory_(trajectory), start_stamp_ns_(start_stamp_ns), config_(config) {
+    : OdometrySimulator([&trajectory](double time_s) { return trajectory.Pose(time_s); },
+                        start_stamp_ns,
+                        config) {}
+
+OdometrySimulator::OdometrySimulator(MotionFunction motion,
+                                     std::int64_t start_stamp_ns,
+                                     const OdometrySimulatorConfig& config)
+    : motion_(std::move(motion)), start_stamp_ns_(start_stamp_ns), config_(config) {
   config_.Validate();
-  T_map_base_previous_ = trajectory_.Pose(0.0);
+  T_map_base_previous_ = motion_(0.0);
   if (config_.model == "t265") {
     const Eigen::Matrix3d R = T_map_base_previous_.linear();
     T_odom_base_.linear() = RotationZ(-std::atan2(R(1, 0), R(0, 0))) * R;
@@ -94,10 +102,10 @@ std::vector<OdometrySample> OdometrySimulator::AdvanceTo(double until_s) {
   while (static_cast<double>(next_index_) * dt <= until_s + 1e-9) {
     const std::int64_t i = next_index_++;
     const double time_s = static_cast<double>(i) * dt;
-    const Eigen::Isometry3d T_map_base = trajectory_.Pose(time_s);
+    const Eigen::Isometry3d T_map_base = motion_(time_s);
     OdometrySample sample;
     sample.stamp_ns = start_stamp_ns_ + std::llround(static_cast<double>(i) * 1e9 / config_.rate_hz);
-    sample.twist = trajectory_.Twist(time_s);
+    sample.twist = TwistOf(motion_, time_s);
     bool lost = false;
 
     if (t265) {

@@ -58,15 +58,7 @@ Eigen::Isometry3d Trajectory::Pose(double time_s) const {
 }
 
 Vector6d Trajectory::Twist(double time_s) const {
-  constexpr double kStep = 1e-3;
-  const Eigen::Isometry3d before = Pose(time_s - kStep);
-  const Eigen::Isometry3d after = Pose(time_s + kStep);
-  const Eigen::Isometry3d here = Pose(time_s);
-  Vector6d twist;
-  twist.head<3>() = LogSo3(before.linear().transpose() * after.linear()) / (2.0 * kStep);
-  twist.tail<3>() =
-      here.linear().transpose() * (after.translation() - before.translation()) / (2.0 * kStep);
-  return twist;
+  return TwistOf([this](double t) { return Pose(t); }, time_s);
 }
 
 }  // namespace dendro

@@ -31,6 +31,7 @@ struct Options {
   std::optional<int> seed;
   std::string odometry;
   bool packets = false;
+  bool imu = false;
   std::string pcap;
   double duration_s = 0.0;
   int threads = 0;
@@ -47,7 +48,8 @@ std::string TruthFolder(const std::string& bag) {
 /// @throws ParamError  Names the option, what is unknown and what there is.
 void ApplySettings(const std::vector<std::string>& settings,
                    dendro::LidarSimulatorConfig* lidar,
-                   dendro::OdometrySimulatorConfig* odometry) {
+                   dendro::OdometrySimulatorConfig* odometry,
+                   dendro::ImuSimulatorConfig* imu) {
   for (const std::string& text : settings) {
     const std::string where = "--set " + text;
     const std::size_t dot = text.find('.');
@@ -62,8 +64,10 @@ void ApplySettings(const std::vector<std::string>& settings,
       dendro_ros::UpdateConfig(tree, where, lidar);
     } else if (section == "odometry") {
       dendro_ros::UpdateConfig(tree, where, odometry);
+    } else if (section == "imu") {
+      dendro_ros::UpdateConfig(tree, where, imu);
     } else {
-      throw dendro_ros::ParamError(where + ": expected the section lidar or odometry");
+      throw dendro_ros::ParamError(where + ": expected the section lidar, odometry or imu");
     }
   }
 }
@@ -74,11 +78,13 @@ void Run(const Options& options) {
   dendro::FlightPath path = dendro::LoadFlightPath(options.path);
   if (!options.odometry.empty()) path.odometry.model = options.odometry;
   dendro::LidarSimulatorConfig lidar;
+  dendro::ImuSimulatorConfig imu_config;
   if (options.seed) {
     lidar.seed = *options.seed;
+    imu_config.seed = *options.seed;
     path.odometry.seed = *options.seed;
   }
-  ApplySettings(options.set, &lidar, &path.odometry);
+  ApplySettings(options.set, &lidar, &path.odometry, &imu_config);
   if (options.duration_s > 0.0) path.duration_s = std::min(path.duration_s, options.duration_s);
 
   const dendro::Raycaster raycaster(scene);
@@ -116,6 +122,13 @@ void Run(const Options& options) {
       }
     }
   };
+  dendro::ImuSimulator imu(
+      [&path](double time_s) { return path.trajectory.Pose(time_s); }, path.start_stamp_ns, imu_config);
+  const auto write_imu = [&](double until_s) {
+    for (const dendro::ImuSample& sample : imu.AdvanceTo(until_s)) {
+      bag.Write(RigMessages::kImuTopic, dendro_ros::ToRosTime(sample.stamp_ns), RigMessages::Imu(sample, imu_config));
+    }
+  };
   const int threads = options.threads > 0
                           ? options.threads
                           : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
@@ -128,6 +141,7 @@ void Run(const Options& options) {
         if (!rig.odometry_topic().empty()) {
           write_odometry(dendro::NsToSeconds(end_ns - path.start_stamp_ns));
         }
+        if (options.imu) write_imu(dendro::NsToSeconds(end_ns - path.start_stamp_ns));
         const ros::Time end = dendro_ros::ToRosTime(end_ns);
         if (packets) {
           const dendro_ros::RevolutionPackets message = packets->Add(scan);
@@ -182,6 +196,7 @@ int main(int argc, char** argv) {
   app.add_option("--odometry", options.odometry, "odometry model instead of the path's")
       ->check(CLI::IsMember({"mavros", "t265", "none"}));
   app.add_flag("--packets", options.packets, "also write /velodyne_packets, /velodyne_position_packets and /fix");
+  app.add_flag("--imu", options.imu, "also write /imu/data_raw, the body's angular rate and specific force");
   app.add_option("--pcap", options.pcap, "also write the packets as a capture");
   app.add_option("--duration", options.duration_s, "end the flight after this time [s]")
       ->check(CLI::PositiveNumber);
@@ -189,10 +204,10 @@ int main(int argc, char** argv) {
       ->check(CLI::PositiveNumber);
   app.add_option("--set",
                  options.set,
-                 "SECTION.KEY=VALUE: a parameter of the sensor (lidar) or the odometry instead of the "
-                 "path's or the default, e.g. lidar.return_mode=dual odometry.jump_time_s=60 "
-                 "odometry.loss_time_s=60; all of them in doc/parameters.md, LidarSimulatorConfig and "
-                 "OdometrySimulatorConfig");
+                 "SECTION.KEY=VALUE: a parameter of the sensor (lidar), the odometry or the imu instead of "
+                 "the path's or the default, e.g. lidar.return_mode=dual odometry.jump_time_s=60 "
+                 "odometry.loss_time_s=60; all of them in doc/parameters.md: LidarSimulatorConfig, "
+                 "OdometrySimulatorConfig, ImuSimulatorConfig");
   CLI11_PARSE(app, argc, argv);
   try {
     Run(options);

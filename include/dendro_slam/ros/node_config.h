@@ -8,7 +8,9 @@
 #include "dendro_slam/ros/params.h"
 #include "dendro_slam/sensors/scan_assembler.h"
 #include "dendro_slam/sensors/vlp16_clock.h"
+#include "dendro_slam/sim/imu_simulator.h"
 #include "dendro_slam/sim/lidar_simulator.h"
+#include "dendro_slam/sim/motion.h"
 
 /// Parameters of the nodelets: those of the stage, and what only a node needs. map_bag reads the same
 /// files.
@@ -156,10 +158,15 @@ struct Vlp16DecoderNodeConfig {
 struct LidarSimulatorNodeConfig {
   std::string scene = "";      ///< Scene file; empty: nothing is simulated.
   std::string path = "";       ///< Flight-path file.
+  std::string pose_source = "path";  ///< path, or topic: fly to the poses (geometry_msgs/PoseStamped of
+                                     ///< base_link in the map) that come on `pose`, from the path's start.
   std::string odometry = "";   ///< t265, mavros or none; empty: as the path says.
   int seed = 1;                ///< Of every random effect.
   double rate = 1.0;           ///< Speed; 1 is real time. > 0.
   bool publish_clock = false;  ///< Publish /clock with the simulated time.
+  bool publish_imu = false;    ///< Publish imu/data_raw.
+  dendro::FollowerConfig follower;
+  dendro::ImuSimulatorConfig imu;
   dendro::LidarSimulatorConfig lidar;
 
   void Validate() const {
@@ -167,16 +174,25 @@ struct LidarSimulatorNodeConfig {
     if (scene.empty() != path.empty()) {
       throw std::invalid_argument("scene and path must be given together");
     }
+    if (pose_source != "path" && pose_source != "topic") {
+      throw std::invalid_argument("pose_source must be path or topic, got '" + pose_source + "'");
+    }
+    follower.Validate();
+    imu.Validate();
     lidar.Validate();
   }
   template <class Visitor>
   void Visit(Visitor&& v) {
     v("scene", scene);
     v("path", path);
+    v("pose_source", pose_source);
     v("odometry", odometry);
     v("seed", seed);
     v("rate", rate);
     v("publish_clock", publish_clock);
+    v("publish_imu", publish_imu);
+    v("follower", follower);
+    v("imu", imu);
     v("lidar", lidar);
   }
 };

@@ -5,11 +5,13 @@
 
 #include <geometry_msgs/PoseStamped.h>
 #include <nav_msgs/Odometry.h>
+#include <sensor_msgs/Imu.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2_msgs/TFMessage.h>
 
 #include "dendro_slam/TreeMap.h"
 #include "dendro_slam/sim/flight_path.h"
+#include "dendro_slam/sim/imu_simulator.h"
 #include "dendro_slam/sim/lidar_simulator.h"
 #include "dendro_slam/sim/odometry_simulator.h"
 #include "dendro_slam/sim/scene.h"
@@ -26,6 +28,7 @@ class RigMessages {
   static constexpr const char* kPacketsTopic = "/velodyne_packets";
   static constexpr const char* kPositionPacketsTopic = "/velodyne_position_packets";
   static constexpr const char* kFixTopic = "/fix";
+  static constexpr const char* kImuTopic = "/imu/data_raw";
   static constexpr const char* kTruthLidarTopic = "/ground_truth/lidar_pose";
   static constexpr const char* kTruthLabelsTopic = "/ground_truth/labels";
   static constexpr const char* kTruthTreesTopic = "/ground_truth/tree_map";
@@ -44,6 +47,9 @@ class RigMessages {
   nav_msgs::Odometry Odometry(const dendro::OdometrySample& sample) const;
   /// odom -> the odometry's child frame.
   tf2_msgs::TFMessage OdometryTransform(const dendro::OdometrySample& sample) const;
+  /// In base_link, without orientation, as REP 145 asks of imu/data_raw. The covariances tell the white
+  /// noise, not the biases.
+  static sensor_msgs::Imu Imu(const dendro::ImuSample& sample, const dendro::ImuSimulatorConfig& config);
   /// True pose of the lidar at the scan's stamp, in the map.
   static geometry_msgs::PoseStamped TruthLidarPose(const dendro::SimulatedScan& scan);
   /// True label (uint8), branch and tree (int16, -1 none) of every return, in the cloud's order; the

@@ -7,6 +7,7 @@
 #include <Eigen/Geometry>
 
 #include "dendro_slam/geometry/se3.h"
+#include "dendro_slam/sim/motion.h"
 
 namespace dendro {
 
@@ -112,6 +113,11 @@ class OdometrySimulator {
                     std::int64_t start_stamp_ns,
                     const OdometrySimulatorConfig& config);
 
+  /// Of any motion; it is asked up to 1 ms later than the newest message.
+  OdometrySimulator(MotionFunction motion,
+                    std::int64_t start_stamp_ns,
+                    const OdometrySimulatorConfig& config);
+
   /// The messages of [0, until_s], as often as `rate_hz`; a later call continues where this ended.
   /// Empty for model "none" and during losses.
   std::vector<OdometrySample> AdvanceTo(double until_s);
@@ -119,7 +125,7 @@ class OdometrySimulator {
  private:
   double Gauss(std::int64_t index, int stream) const;
 
-  const Trajectory& trajectory_;
+  MotionFunction motion_;
   std::int64_t start_stamp_ns_;
   OdometrySimulatorConfig config_;
   std::int64_t next_index_ = 0;
