@@ -20,6 +20,7 @@
 #include "dendro_slam/ros/conversions.h"
 #include "dendro_slam/ros/latency_collector.h"
 #include "dendro_slam/ros/map_frames.h"
+#include "dendro_slam/ros/map_session.h"
 #include "dendro_slam/ros/node_config.h"
 #include "dendro_slam/ros/scan_gate.h"
 #include "dendro_slam/ros/stage_diagnostics.h"
@@ -36,7 +37,8 @@ class TreeMapping : public nodelet::Nodelet {
   struct IcpOdometry {
     Odometry msg;
   };
-  using Input = std::variant<Cylinders, Odometry, IcpOdometry>;
+  struct RestoreSession {};
+  using Input = std::variant<Cylinders, Odometry, IcpOdometry, RestoreSession>;
   struct WaitingScan {
     Cylinders cylinders;
     std::shared_ptr<const dendro::RelativeMotion> icp;  ///< Null: ICP found no motion.
@@ -59,8 +61,14 @@ class TreeMapping : public nodelet::Nodelet {
       map_ = nh.advertise<dendro_slam::TreeMap>("tree_map", 1, true);
       path_ = nh.advertise<nav_msgs::Path>("path", 1, true);
       status_ = private_nh.advertise<dendro_slam::GraphStatus>("graph_status", 100);
+      if (!config_.session_directory.empty()) {
+        session_.emplace(config_.session_directory, config_.session_id, config_.resume);
+      }
+      saved_ = ros::SteadyTime::now();
       worker_ =
           std::make_unique<Worker<Input>>(2 * capacity, [this](Input& input) { Work(input); });
+      // First in the queue: scans wait behind it.
+      if (session_ && session_->found()) worker_->Push(RestoreSession{}, false);
       latency_subscriber_ = nh.subscribe<dendro_slam::StageLatency>(
           "stage_latency", 1000, [this](const dendro_slam::StageLatencyConstPtr& latency) {
             latencies_.Add(*latency);
@@ -95,6 +103,8 @@ class TreeMapping : public nodelet::Nodelet {
         if (gate_->AddOdometry(**odometry) == GateEvent::kTimeJumpedBack) {
           TimeJumpedBack(odometry_subscriber_.getTopic());
         }
+      } else if (std::holds_alternative<RestoreSession>(input)) {
+        Restore();
       } else if (const auto* icp = std::get_if<IcpOdometry>(&input)) {
         join_->AddSecond(ToNs(icp->msg->header.stamp), *icp);
       } else {
@@ -149,6 +159,7 @@ class TreeMapping : public nodelet::Nodelet {
 
   void Forget() {
     stage_->Reset();
+    if (session_) session_->StartAnew();
     last_icp_.reset();
     latencies_.Reset();
     diagnostics_->ResetCounts();
@@ -165,6 +176,7 @@ class TreeMapping : public nodelet::Nodelet {
     if (gate_->poses() != nullptr) T_odom_body = gate_->poses()->Lookup(input.stamp_ns);
     if (T_odom_body) input.T_odom_lidar = *T_odom_body * gate_->T_body_lidar();
     const dendro::MapperResult result = stage_->Process(input, GroundFromMsg(*scan.cylinders));
+    KeepInSession(input, *scan.cylinders, result.is_key_frame);
     diagnostics_->Processed(input.stamp_ns, watch.Seconds());
     if (!result.warning.empty()) NODELET_WARN_THROTTLE(5.0, "%s", result.warning.c_str());
     // WoodSegmentation needs the same transform and says on the console what is missing.
@@ -172,6 +184,51 @@ class TreeMapping : public nodelet::Nodelet {
     PublishStatus(result, input, watch.Seconds());
     if (config_.publish_tf) PublishTransforms(result, header, T_odom_body);
     if (result.is_key_frame) PublishMap();
+  }
+
+  /// Maps again what the process that died had mapped.
+  void Restore() {
+    const Stopwatch watch;
+    if (session_->HasBase()) stage_->Load(dendro::LoadMap(session_->base_directory()));
+    const std::size_t scans = session_->ForEach([this](const dendro_slam::MappedScan& scan) {
+      stage_->Process(FromMsg(scan), GroundFromMsg(scan.cylinders));
+    });
+    if (!session_->same_run()) {
+      // The odometry has begun anew elsewhere: the place must be recognised first.
+      const dendro::MapFiles files = stage_->Files(DescribeConfig(config_.stage));
+      session_->StartAnew();
+      dendro::SaveMap(session_->base_directory(), files);
+      stage_->Load(files);
+    }
+    diagnostics_->Show("scans restored", static_cast<double>(scans));
+    NODELET_WARN("the map of %zu scans in %s was restored in %.1f s",
+                 scans,
+                 config_.session_directory.c_str(),
+                 watch.Seconds());
+    PublishMap();
+  }
+
+  void KeepInSession(const dendro::MapperInput& input,
+                     const dendro_slam::ScanCylinders& cylinders,
+                     bool is_key_frame) {
+    if (!session_) return;
+    try {
+      session_->Append(ToMappedScan(input, cylinders));
+      if (!is_key_frame || (ros::SteadyTime::now() - saved_).toSec() < config_.autosave_s) return;
+      saved_ = ros::SteadyTime::now();
+      SaveTo(session_->map_directory());
+    } catch (const std::exception& error) {
+      diagnostics_->Problem(error.what());
+      NODELET_ERROR("mapping goes on, but a crash would lose the map from here on: %s", error.what());
+    }
+  }
+
+  dendro::MapFiles SaveTo(const std::string& directory) {
+    dendro::MapFiles files = stage_->Files(DescribeConfig(config_.stage));
+    files.frame = config_.map_frame;
+    const dendro::StageTimer timer = latencies_.Timer();
+    dendro::SaveMap(directory, files, &timer);
+    return files;
   }
 
   void PublishStatus(const dendro::MapperResult& result,
@@ -217,18 +274,16 @@ class TreeMapping : public nodelet::Nodelet {
   }
 
   bool Save(dendro_slam::SaveMap::Request& request, dendro_slam::SaveMap::Response& response) {
-    const std::string directory =
-        request.directory.empty() ? config_.output_directory : request.directory;
+    std::string directory = request.directory;
+    if (directory.empty()) directory = config_.output_directory;
+    if (directory.empty() && session_) directory = session_->map_directory();
     if (directory.empty()) {
       response.message = "no directory: name one in the request or set output_directory";
       return true;
     }
     const std::lock_guard<std::mutex> lock(mutex_);
     try {
-      dendro::MapFiles files = stage_->Files(DescribeConfig(config_.stage));
-      files.frame = config_.map_frame;
-      const dendro::StageTimer timer = latencies_.Timer();
-      dendro::SaveMap(directory, files, &timer);
+      const dendro::MapFiles files = SaveTo(directory);
       PublishMap();
       response.success = true;
       response.message = "map of " + std::to_string(files.model.branches.size()) +
@@ -246,6 +301,10 @@ class TreeMapping : public nodelet::Nodelet {
     try {
       const dendro::MapFiles files = dendro::LoadMap(request.directory);
       stage_->Load(files);
+      if (session_) {
+        session_->StartAnew();
+        dendro::SaveMap(session_->base_directory(), files);
+      }
       PublishMap();
       response.success = true;
       response.message = "map of " + std::to_string(stage_->model().branches.size()) +
@@ -291,6 +350,8 @@ class TreeMapping : public nodelet::Nodelet {
   ros::ServiceServer save_;
   ros::ServiceServer load_;
   ros::ServiceServer reset_;
+  std::optional<MapSession> session_;
+  ros::SteadyTime saved_;
   std::unique_ptr<Worker<Input>> worker_;  // Last: its thread uses everything above.
 };
 

@@ -494,6 +494,52 @@ std::optional<dendro::GroundPlane> GroundFromMsg(const dendro_slam::ScanCylinder
   return ground;
 }
 
+dendro_slam::MappedScan ToMappedScan(const dendro::MapperInput& input,
+                                     const dendro_slam::ScanCylinders& cylinders) {
+  // 3 x 4, row by row, so that the bits stay.
+  const auto rows = [](const Eigen::Isometry3d& T) {
+    std::vector<double> values;
+    for (int i = 0; i < 12; ++i) values.push_back(T(i / 4, i % 4));
+    return values;
+  };
+  dendro_slam::MappedScan msg;
+  msg.cylinders = cylinders;
+  if (input.T_odom_lidar) msg.lidar_in_odometry = rows(*input.T_odom_lidar);
+  if (input.icp) {
+    msg.icp_motion = rows(input.icp->T_from_to);
+    msg.icp_from_ns = input.icp->from_stamp_ns;
+    for (int i = 0; i < 36; ++i) msg.icp_covariance.push_back(input.icp->covariance(i / 6, i % 6));
+  }
+  return msg;
+}
+
+dendro::MapperInput FromMsg(const dendro_slam::MappedScan& scan) {
+  const auto transform = [](const std::vector<double>& values) {
+    if (values.size() != 12) throw std::invalid_argument("a transform must have 12 numbers");
+    Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
+    for (int i = 0; i < 12; ++i) T(i / 4, i % 4) = values[static_cast<std::size_t>(i)];
+    return T;
+  };
+  dendro::MapperInput input;
+  input.stamp_ns = ToNs(scan.cylinders.header.stamp);
+  input.cylinders = FromMsg(scan.cylinders);
+  if (!scan.lidar_in_odometry.empty()) input.T_odom_lidar = transform(scan.lidar_in_odometry);
+  if (!scan.icp_motion.empty()) {
+    if (scan.icp_covariance.size() != 36) {
+      throw std::invalid_argument("a covariance must have 36 numbers");
+    }
+    dendro::RelativeMotion motion;
+    motion.from_stamp_ns = scan.icp_from_ns;
+    motion.to_stamp_ns = input.stamp_ns;
+    motion.T_from_to = transform(scan.icp_motion);
+    for (int i = 0; i < 36; ++i) {
+      motion.covariance(i / 6, i % 6) = scan.icp_covariance[static_cast<std::size_t>(i)];
+    }
+    input.icp = motion;
+  }
+  return input;
+}
+
 std::vector<dendro::FittedCylinder> FromMsg(const dendro_slam::ScanCylinders& cylinders) {
   std::vector<dendro::FittedCylinder> result;
   result.reserve(cylinders.cylinders.size());

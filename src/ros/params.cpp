@@ -111,17 +111,13 @@ std::size_t EditDistance(const std::string& a, const std::string& b) {
   return row[b.size()];
 }
 
-[[noreturn]] void FailType(const ParamTree& tree, const std::string& where, const char* expected) {
-  throw ParamError(fmt::format("{}: expected {}, got {}", where, expected, tree.TypeName()));
-}
-
 }  // namespace
 
 const ParamTree::Map& ParamTree::AsMap(const std::string& where) const {
   static const Map kEmpty;
   if (std::holds_alternative<std::monostate>(value)) return kEmpty;
   if (const Map* map = std::get_if<Map>(&value)) return *map;
-  FailType(*this, where, "a group of parameters");
+  internal::FailType(*this, where, "a group of parameters");
 }
 
 const char* ParamTree::TypeName() const {
@@ -174,6 +170,10 @@ std::string NearestKey(const std::string& key, const std::vector<std::string>& k
 }
 
 namespace internal {
+
+void FailType(const ParamTree& tree, const std::string& where, const char* expected) {
+  throw ParamError(fmt::format("{}: expected {}, got {}", where, expected, tree.TypeName()));
+}
 
 void Assign(const ParamTree& tree, const std::string& where, bool& value) {
   const bool* read = std::get_if<bool>(&tree.value);

@@ -36,6 +36,7 @@ void UdpSourceConfig::Validate() const {
   if (receive_buffer_bytes < 1) {
     throw std::invalid_argument("receive_buffer_bytes must be positive");
   }
+  if (inherited_fd < -1) throw std::invalid_argument("inherited_fd must be a descriptor or -1");
 }
 
 struct UdpSource::State {
@@ -62,7 +63,8 @@ UdpSource::UdpSource(const UdpSourceConfig& config) : state_(std::make_unique<St
     throw UdpError("udp " + config.address + ":" + std::to_string(config.port) + ": " + what + ": " +
                    std::strerror(errno));
   };
-  s.fd = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  const bool inherited = config.inherited_fd >= 0;
+  s.fd = inherited ? config.inherited_fd : socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
   if (s.fd < 0) fail("socket");
   // The forced size needs a privilege; without it the kernel's limit (net.core.rmem_max) applies.
   const int bytes = config.receive_buffer_bytes;
@@ -80,7 +82,9 @@ UdpSource::UdpSource(const UdpSourceConfig& config) : state_(std::make_unique<St
   local.sin_family = AF_INET;
   local.sin_port = htons(static_cast<std::uint16_t>(config.port));
   ParseAddress(config.address, local.sin_addr);
-  if (bind(s.fd, reinterpret_cast<const sockaddr*>(&local), sizeof(local)) != 0) fail("bind");
+  if (!inherited && bind(s.fd, reinterpret_cast<const sockaddr*>(&local), sizeof(local)) != 0) {
+    fail("bind");
+  }
   length = sizeof(local);
   if (getsockname(s.fd, reinterpret_cast<sockaddr*>(&local), &length) != 0) fail("bind");
   s.port = ntohs(local.sin_port);

@@ -23,6 +23,7 @@ TEST(ShippedConfig, EveryFileLoads) {
   for (const auto& entry :
        std::filesystem::directory_iterator(std::string(DENDRO_SOURCE_DIR) + "/config")) {
     if (entry.path().extension() != ".yaml") continue;
+    if (entry.path().filename() == "rig.yaml") continue;  // Of driver_bridge, which tests it.
     const std::string path = entry.path().string();
     const ParamTree tree = ReadYamlFile(path);
     EXPECT_NO_THROW(ReadConfig<NodesConfig>(tree, path)) << path;

@@ -14,6 +14,7 @@
 #include <sensor_msgs/PointCloud2.h>
 
 #include "dendro_slam/GraphStatus.h"
+#include "dendro_slam/MappedScan.h"
 #include "dendro_slam/ScanCylinders.h"
 #include "dendro_slam/segmentation/ground_plane.h"
 #include "dendro_slam/Segments.h"
@@ -117,6 +118,13 @@ dendro_slam::ScanCylindersPtr ToMsg(const std::vector<dendro::FittedCylinder>& c
 std::optional<dendro::GroundPlane> GroundFromMsg(const dendro_slam::ScanCylinders& cylinders);
 /// @throws std::invalid_argument  A value that is not finite, or an unknown status.
 std::vector<dendro::FittedCylinder> FromMsg(const dendro_slam::ScanCylinders& cylinders);
+
+/// What the mapper is given for a scan, to be kept; bit by bit the same when it comes back.
+/// @param cylinders  The message that `input.cylinders` was made of.
+dendro_slam::MappedScan ToMappedScan(const dendro::MapperInput& input,
+                                     const dendro_slam::ScanCylinders& cylinders);
+/// @throws std::invalid_argument  An array of the wrong size, or as for the cylinders.
+dendro::MapperInput FromMsg(const dendro_slam::MappedScan& scan);
 
 dendro_slam::TreeMapPtr ToMsg(const dendro::TreeModel& model, const std::string& frame_id);
 dendro::TreeModel FromMsg(const dendro_slam::TreeMap& map);

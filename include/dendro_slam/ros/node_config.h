@@ -93,6 +93,13 @@ struct TreeMappingNodeConfig {
   bool use_icp = true;                ///< False: odometry alone.
   std::string map_frame = "map";      ///< Frame of the map.
   std::string output_directory = "";  ///< Where save_map writes when its request names no folder.
+  std::string session_directory = "";  ///< Folder where the map is kept against crashes: what was
+                                       ///< mapped is written there scan by scan, and read again when
+                                       ///< the process is started again; empty: nowhere.
+  std::string session_id = "";  ///< Of this run: a map of the same run is gone on with at the start.
+  bool resume = false;          ///< Go on with the map of an earlier run in that folder too: it is
+                                ///< loaded, and used once the place is recognised.
+  double autosave_s = 60.0;     ///< The map directory in that folder is written this often [s]. > 0.
   bool publish_tf = true;             ///< Publish map -> odom (map -> lidar without odometry).
   bool publish_odometry_tf = false;   ///< Publish odom -> body too, where nobody else does.
   LidarMountConfig lidar_mount;
@@ -101,6 +108,7 @@ struct TreeMappingNodeConfig {
   void Validate() const {
     CheckQueueSize(queue_size);
     if (map_frame.empty()) throw std::invalid_argument("map_frame must not be empty");
+    if (!(autosave_s > 0.0)) throw std::invalid_argument("autosave_s must be positive");
     stage.Validate();
   }
   template <class Visitor>
@@ -110,6 +118,10 @@ struct TreeMappingNodeConfig {
     v("use_icp", use_icp);
     v("map_frame", map_frame);
     v("output_directory", output_directory);
+    v("session_directory", session_directory);
+    v("session_id", session_id);
+    v("resume", resume);
+    v("autosave_s", autosave_s);
     v("publish_tf", publish_tf);
     v("publish_odometry_tf", publish_odometry_tf);
     v("lidar_mount", lidar_mount);

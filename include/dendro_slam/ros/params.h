@@ -83,6 +83,7 @@ void Assign(const ParamTree& tree, const std::string& where, bool& value);
 void Assign(const ParamTree& tree, const std::string& where, int& value);
 void Assign(const ParamTree& tree, const std::string& where, double& value);
 void Assign(const ParamTree& tree, const std::string& where, std::string& value);
+[[noreturn]] void FailType(const ParamTree& tree, const std::string& where, const char* expected);
 [[noreturn]] void FailUnknown(const std::string& where,
                               const std::string& key,
                               const std::vector<std::string>& known);
@@ -104,6 +105,28 @@ struct KeyLister {
 template <class Config>
 void ReadInto(const ParamTree& tree, const std::string& where, Config& config);
 
+template <class T>
+void Read(const ParamTree& tree, const std::string& where, T& value) {
+  if constexpr (IsConfig<T>::value) {
+    ReadInto(tree, where, value);
+  } else {
+    Assign(tree, where, value);
+  }
+}
+
+/// A list of texts, numbers or config structs.
+template <class T>
+void Read(const ParamTree& tree, const std::string& where, std::vector<T>& values) {
+  const ParamTree::List* list = std::get_if<ParamTree::List>(&tree.value);
+  if (list == nullptr) FailType(tree, where, "a list");
+  values.clear();
+  for (const ParamTree& item : *list) {
+    T value{};
+    Read(item, where + "[" + std::to_string(values.size()) + "]", value);
+    values.push_back(std::move(value));
+  }
+}
+
 struct FieldAssigner {
   const ParamTree::Map& map;
   const std::string& where;
@@ -113,12 +136,7 @@ struct FieldAssigner {
     known.emplace_back(key);
     const auto it = map.find(key);
     if (it == map.end()) return;
-    const std::string here = where + "/" + key;
-    if constexpr (IsConfig<T>::value) {
-      ReadInto(it->second, here, value);
-    } else {
-      Assign(it->second, here, value);
-    }
+    Read(it->second, where + "/" + key, value);
   }
 };
 

@@ -20,6 +20,9 @@ struct UdpSourceConfig {
   int port = 2368;                  ///< UDP port, [0, 65535]; 0 takes any free one.
   std::string sender;               ///< Only datagrams from this IPv4 address; empty: from any.
   int receive_buffer_bytes = 8388608;  ///< Asked of the kernel; see buffer_bytes(). > 0.
+  int inherited_fd = -1;  ///< A socket that is bound already, handed down by a parent process that
+                          ///< keeps it open, so that datagrams wait in it while a reader that died
+                          ///< is started again; -1: bind one.
 
   void Validate() const;
   template <class Visitor>
@@ -28,6 +31,7 @@ struct UdpSourceConfig {
     v("port", port);
     v("sender", sender);
     v("receive_buffer_bytes", receive_buffer_bytes);
+    v("inherited_fd", inherited_fd);
   }
 };
 
