@@ -35,7 +35,7 @@ class Vlp16Decoder : public nodelet::Nodelet {
       worker_ = std::make_unique<Worker<Input>>(static_cast<std::size_t>(config_.queue_size),
                                                 [this](Input& packets) { Work(*packets); });
       subscriber_ = nh.subscribe<VelodyneScan>(
-          "velodyne_packets", 100, [this](const VelodyneScan::ConstPtr& packets) {
+          "velodyne_packets", 1000, [this](const VelodyneScan::ConstPtr& packets) {
             diagnostics_->Dropped("queue full", worker_->Push(packets, true));
           });
     } catch (const std::exception& error) {

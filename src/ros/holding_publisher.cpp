@@ -19,25 +19,63 @@ HoldingPublisher::HoldingPublisher(ros::NodeHandle nh,
                                    HoldingConfig config)
     : config_(std::move(config)) {
   for (const std::string& reader : config_.readers) readers_[reader] = Reader();
-  options.connect_cb = [this](const ros::SingleSubscriberPublisher& link) {
-    Changed(link.getSubscriberName(), true);
-  };
+  options.connect_cb = [this](const ros::SingleSubscriberPublisher& link) { OnConnect(link); };
   options.disconnect_cb = [this](const ros::SingleSubscriberPublisher& link) {
-    Changed(link.getSubscriberName(), false);
+    OnDisconnect(link.getSubscriberName());
   };
   publisher_ = nh.advertise(options);
 }
 
-void HoldingPublisher::Changed(const std::string& reader, bool connected) {
+HoldingPublisher::~HoldingPublisher() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ending_ = true;
+  }
+  wake_.notify_all();
+  publisher_.shutdown();  // Waits for callbacks at work.
+}
+
+void HoldingPublisher::OnConnect(const ros::SingleSubscriberPublisher& link) {
+  std::unique_lock<std::mutex> lock(mutex_);
+  const auto it = readers_.find(link.getSubscriberName());
+  if (it == readers_.end()) return;
+  Reader& reader = it->second;
+  reader.connected = true;
+  reader.released = false;
+  reader.since = Clock::now();
+  reader.settle_s = reader.seen ? config_.settle_s : kFirstSettle_s;
+  reader.seen = true;
+  const int coming = ++reader.comings;
+  if (it->first != config_.acknowledger || kept_.empty()) return;
+  reader.catching_up = true;
+  const auto settled = reader.since + std::chrono::duration_cast<Clock::duration>(
+                                          std::chrono::duration<double>(reader.settle_s));
+  wake_.wait_until(lock, settled, [this] { return ending_; });
+  // The link is good for this callback only.
+  if (ending_ || reader.comings != coming || !reader.connected) return;
+  for (const Message& message : kept_) message.send_again(link);
+  reader.catching_up = false;
+  Flush();
+}
+
+void HoldingPublisher::OnDisconnect(const std::string& name) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  const auto it = readers_.find(name);
+  if (it == readers_.end()) return;
+  it->second.connected = false;
+  it->second.catching_up = false;
+  it->second.since = Clock::now();
+}
+
+void HoldingPublisher::Release(const std::string& reader) {
   const std::lock_guard<std::mutex> lock(mutex_);
   const auto it = readers_.find(reader);
-  if (it == readers_.end()) return;
-  it->second.connected = connected;
-  it->second.since = Clock::now();
-  if (connected) {
-    it->second.settle_s = it->second.seen ? config_.settle_s : kFirstSettle_s;
-    it->second.seen = true;
-  }
+  if (it != readers_.end()) it->second.released = true;
+}
+
+void HoldingPublisher::Acknowledge(std::int64_t stamp_ns) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  while (!kept_.empty() && kept_.front().until_ns <= stamp_ns) kept_.pop_front();
 }
 
 bool HoldingPublisher::Waiting() const {
@@ -45,6 +83,8 @@ bool HoldingPublisher::Waiting() const {
   for (const auto& entry : readers_) {
     const Reader& reader = entry.second;
     const double passed_s = std::chrono::duration<double>(now - reader.since).count();
+    if (reader.released) continue;
+    if (reader.catching_up) return true;
     if (passed_s < (reader.connected ? reader.settle_s : config_.hold_s)) return true;
   }
   return false;
@@ -59,9 +99,9 @@ std::vector<std::string> HoldingPublisher::MissingReaders() const {
   return missing;
 }
 
-void HoldingPublisher::Push(std::function<void()> send) {
+void HoldingPublisher::Push(Message message) {
   const std::lock_guard<std::mutex> lock(mutex_);
-  line_.push_back(std::move(send));
+  line_.push_back(std::move(message));
   if (!Waiting()) Flush();
 }
 
@@ -76,9 +116,17 @@ std::size_t HoldingPublisher::held() const {
 }
 
 void HoldingPublisher::Flush() {
+  const Clock::time_point now = Clock::now();
+  const auto keep = std::chrono::duration<double>(config_.keep_s);
+  while (!kept_.empty() && now - kept_.front().sent > keep) kept_.pop_front();
   while (!line_.empty()) {
-    line_.front()();
+    Message message = std::move(line_.front());
     line_.pop_front();
+    message.send();
+    if (!message.send_again) continue;
+    message.send = nullptr;
+    message.sent = now;
+    kept_.push_back(std::move(message));
   }
 }
 

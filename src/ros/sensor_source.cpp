@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cerrno>
 #include <charconv>
 #include <chrono>
@@ -21,8 +22,10 @@
 #include <fmt/format.h>
 #include <nav_msgs/Odometry.h>
 #include <sensor_msgs/NavSatFix.h>
+#include <std_msgs/String.h>
 #include <topic_tools/shape_shifter.h>
 
+#include "dendro_slam/GraphStatus.h"
 #include "dendro_slam/ros/conversions.h"
 #include "dendro_slam/ros/holding_publisher.h"
 #include "dendro_slam/ros/velodyne_msgs.h"
@@ -41,6 +44,8 @@ constexpr double kReportEveryS = 1.0;
 constexpr double kSilenceS = 2.0;       ///< A sensor that is on and says nothing for this long.
 constexpr double kLongestTurnS = 0.25;  ///< Slower than 300 rpm: packets are sent on all the same.
 constexpr std::size_t kMostPackets = 400;
+/// A scan needs the poses before it, and the packet before it, whose last firings are its first.
+constexpr std::int64_t kOverlapNs = 250000000;
 
 std::int64_t ParseNs(const std::string& text, const char* field) {
   std::int64_t value = 0;
@@ -188,6 +193,16 @@ class SensorSource::Impl {
     holding_.readers = config.readers;
     holding_.hold_s = config.hold_s;
     holding_.settle_s = config.settle_s;
+    if (!config.released_on.empty()) {
+      releases_ = nh_.subscribe(config.released_on, 10, &Impl::OnReleased, this);
+    }
+    if (!config.acknowledged_on.empty() && !config.readers.empty()) {
+      holding_.acknowledger = config.acknowledged_by;
+      acknowledgements_ = nh_.subscribe<dendro_slam::GraphStatus>(
+          config.acknowledged_on, 100, [this](const dendro_slam::GraphStatusConstPtr& status) {
+            acknowledged_ns_ = ToNs(status->header.stamp);
+          });
+    }
   }
 
   void Run() {
@@ -212,6 +227,11 @@ class SensorSource::Impl {
   double ScriptS() const { return static_cast<double>(HostNs() - timing_.started_ns) * 1e-9; }
   bool On(double script_s) const { return script_s >= config_.start_s && script_s < config_.stop_s; }
 
+  void OnReleased(const std_msgs::String& reader) {
+    const std::lock_guard<std::mutex> lock(released_mutex_);
+    released_ = reader.data;
+  }
+
   /// What is due every few milliseconds, whatever the source.
   void Tick() {
     const std::int64_t now_ns = HostNs();
@@ -220,7 +240,16 @@ class SensorSource::Impl {
       late_.pop_front();
       send();
     }
-    if (main_) main_->Tick();
+    if (main_) {
+      {
+        const std::lock_guard<std::mutex> lock(released_mutex_);
+        if (!released_.empty()) main_->Release(released_);
+        if (!released_.empty() && fix_) fix_->Release(released_);
+        released_.clear();
+      }
+      main_->Tick();
+      if (acknowledged_ns_ > 0) main_->Acknowledge(acknowledged_ns_ - kOverlapNs);
+    }
     if (fix_) fix_->Tick();
     Report(false);
   }
@@ -293,9 +322,11 @@ class SensorSource::Impl {
     const VelodyneScan::ConstPtr scan = std::move(scan_);
     scan_.reset();
     const std::int64_t recorded_ns = last_recorded_ns_;
-    Send(delay_ns_, [this, scan, recorded_ns] {
+    const std::int64_t until_ns = ToNs(scan->packets.back().stamp);
+    Send(delay_ns_, [this, scan, recorded_ns, until_ns] {
       rate_.Add();
-      main_->Publish<VelodyneScan>(scan, [this, recorded_ns] { progress_.Write(recorded_ns); });
+      main_->Publish<VelodyneScan>(
+          scan, until_ns, [this, recorded_ns] { progress_.Write(recorded_ns); });
     });
   }
 
@@ -313,7 +344,7 @@ class SensorSource::Impl {
     const auto msg = boost::make_shared<const sensor_msgs::NavSatFix>(
         ToFixMsg(*fix, fix->stamp_ns + fault.stamp_shift_ns));
     valid_fixes_ += fix->valid ? 1 : 0;
-    Send(fault.delay_ns, [this, msg] { fix_->Publish<sensor_msgs::NavSatFix>(msg); });
+    Send(fault.delay_ns, [this, msg] { fix_->Publish<sensor_msgs::NavSatFix>(msg, 0); });
   }
 
   void RunUdp() {
@@ -409,7 +440,9 @@ class SensorSource::Impl {
     const std::int64_t recorded_ns = pose.stamp_ns;
     Send(fault.delay_ns, [this, msg, recorded_ns] {
       rate_.Add();
-      main_->Publish<nav_msgs::Odometry>(msg, [this, recorded_ns] { progress_.Write(recorded_ns); });
+      main_->Publish<nav_msgs::Odometry>(msg, ToNs(msg->header.stamp), [this, recorded_ns] {
+        progress_.Write(recorded_ns);
+      });
     });
   }
 
@@ -471,7 +504,7 @@ class SensorSource::Impl {
     }
     Send(fault.delay_ns, [this, out] {
       rate_.Add();
-      main_->Publish<topic_tools::ShapeShifter>(out);
+      main_->Publish<topic_tools::ShapeShifter>(out, 0);
     });
   }
 
@@ -626,7 +659,12 @@ class SensorSource::Impl {
   const std::int64_t offset_ns_;
   dendro::ReplayTiming timing_;
   HoldingConfig holding_;
+  std::atomic<std::int64_t> acknowledged_ns_{0};  ///< The last scan that was mapped.
   ros::Publisher diagnostics_;
+  ros::Subscriber acknowledgements_;
+  std::mutex released_mutex_;
+  std::string released_;
+  ros::Subscriber releases_;
   std::unique_ptr<HoldingPublisher> main_;
   std::unique_ptr<HoldingPublisher> fix_;
   std::deque<Late> late_;

@@ -49,9 +49,10 @@ int main(int argc, char** argv) {
     ros::init(argc, argv, "sensor_source");
     ros::NodeHandle nh;
     dendro_ros::SensorSource source(nh, ros::this_node::getName(), config);
-    ros::AsyncSpinner spinner(1);
+    ros::AsyncSpinner spinner(4);  // One may wait for a reader to settle.
     spinner.start();
     source.Run();
+    if (!ros::ok()) return 130;  // Interrupted, not at its end.
   } catch (const std::exception& error) {
     fmt::print(stderr, "{}\n", error.what());
     return 1;

@@ -49,6 +49,10 @@ struct SensorSourceConfig {
   std::vector<std::string> readers;  ///< Nodes that must not miss a message while they are restarted.
   double hold_s = 10.0;              ///< They are waited for at most this long [s].
   double settle_s = 1.0;             ///< And given this time after they came back [s].
+  std::string acknowledged_by = "";  ///< The reader that maps: it is sent again what died with it.
+  std::string acknowledged_on = "";  ///< Its dendro_slam/GraphStatus topic; empty: nothing is kept.
+  std::string released_on = "";  ///< std_msgs/String topic that names a reader which is gone on
+                                 ///< purpose and not to be waited for; empty: none.
   std::string progress = "";  ///< File that remembers how far a replay is, across restarts.
 
   /// @throws std::invalid_argument naming the field.
@@ -84,6 +88,9 @@ struct SensorSourceConfig {
     v("readers", readers);
     v("hold_s", hold_s);
     v("settle_s", settle_s);
+    v("acknowledged_by", acknowledged_by);
+    v("acknowledged_on", acknowledged_on);
+    v("released_on", released_on);
     v("progress", progress);
   }
 };

@@ -1,0 +1,1 @@
+"""What scripts/driver_bridge is made of: the script, the processes it supervises, the recording."""
