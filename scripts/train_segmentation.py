@@ -4,6 +4,7 @@
   scripts/train_segmentation.py                     simulate data if there is none, train, export
   scripts/train_segmentation.py --resume            go on where an interrupted training stopped
   scripts/train_segmentation.py --evaluate FILE     score a weights file on the held-out scans
+  scripts/train_segmentation.py --image 32x360      the same for the thesis' size of image
   scripts/train_segmentation.py --fixture DIR       write the small network the C++ test compares with
 
 The data comes from the program simulate_training_scans (scripts/build builds it): range images
@@ -32,18 +33,20 @@ import torch.nn.functional as F
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 CLASSES = ["ground", "wood", "leaf", "other"]
 WOOD, OTHER = 1, 3
-PLANES = 8
-MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE = range(PLANES)
+PLANES = 9
+MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE, SIDE = range(PLANES)
 IGNORE = 255
 
-LAYERS = ("stem:16:3x5:1x2 nb:1x1 push "
-          "down:32:2x2 nb:1x1 nb:1x2 push "
+LAYERS = ("stem:16:3x5:1x2 push "
+          "down:32:2x2 nb:1x2 push "
           "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
-          "up:32:2x2 add nb:1x1 "
-          "up:16:2x2 add nb:1x1 "
-          "out:4:3x4:1x2")
-FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x2 nb:2x4 "
-                  "up:10:2x2 add up:6:2x2 add nb:1x1 out:4:3x4:1x2")
+          "grow:32:1x1:2x2 add conv:32:3x3 "
+          "grow:16:1x1:2x2 add conv:32:3x3 "
+          "last:4:1x1:1x2")
+# A pixel of the thesis' image is a whole degree: no azimuth to spare for a stride in the input layer.
+LAYERS_32X360 = LAYERS.replace("stem:16:3x5:1x2", "stem:16:3x5:1x1").replace("last:4:1x1:1x2", "last:4:1x1:1x1")
+FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x1 nb:2x4 "
+                  "grow:10:1x1:2x1 add conv:7:3x5 grow:6:3x3:2x2 add last:4:1x3:1x2")
 
 
 # ---------------------------------------------------------------------------------------------
@@ -68,6 +71,11 @@ class Stem(nn.Module):
 
     def export(self):
         return fold("conv", self.conv, self.bn)
+
+
+class Conv(Stem):
+    def __init__(self, c_in, c_out, kernel):
+        super().__init__(c_in, c_out, kernel, (1, 1))
 
 
 class Down(nn.Module):
@@ -115,32 +123,38 @@ class NonBottleneck1d(nn.Module):
                 **fold("conv4", self.conv4, self.bn2)}
 
 
-def transposed(c_in, c_out, kernel, stride, bias):
-    padding = tuple((k - s + 1) // 2 for k, s in zip(kernel, stride))
-    extra = tuple(s - k + 2 * p for k, s, p in zip(kernel, stride, padding))
-    return nn.ConvTranspose2d(c_in, c_out, kernel, stride, padding, extra, bias=bias)
+def interleave(x, stride):
+    """Channels to pixels: torch's pixel_shuffle with a stride per axis."""
+    n, c, h, w = x.shape
+    sh, sw = stride
+    x = x.view(n, c // (sh * sw), sh, sw, h, w).permute(0, 1, 4, 2, 5, 3)
+    return x.reshape(n, c // (sh * sw), h * sh, w * sw)
 
 
-class Up(nn.Module):
-    def __init__(self, c_in, c_out, stride):
+class Grow(nn.Module):
+    def __init__(self, c_in, c_out, kernel, stride):
         super().__init__()
-        self.conv = transposed(c_in, c_out, (3, 3), stride, False)
+        self.stride = stride
+        c_out *= stride[0] * stride[1]
+        self.conv = nn.Conv2d(c_in, c_out, kernel, 1, (kernel[0] // 2, kernel[1] // 2), bias=False)
         self.bn = batch_norm(c_out)
 
     def forward(self, x):
-        return F.relu(self.bn(self.conv(x)))
+        return interleave(F.relu(self.bn(self.conv(x))), self.stride)
 
     def export(self):
-        return fold("conv", self.conv, self.bn, out_axis=1)
+        return fold("conv", self.conv, self.bn)
 
 
-class Out(nn.Module):
+class Last(nn.Module):
     def __init__(self, c_in, classes, kernel, stride):
         super().__init__()
-        self.conv = transposed(c_in, classes, kernel, stride, True)
+        self.stride = stride
+        self.conv = nn.Conv2d(c_in, classes * stride[0] * stride[1], kernel, 1,
+                              (kernel[0] // 2, kernel[1] // 2))
 
     def forward(self, x):
-        return self.conv(x)
+        return interleave(self.conv(x), self.stride)
 
     def export(self):
         return {"conv.weight": self.conv.weight, "conv.bias": self.conv.bias}
@@ -176,14 +190,17 @@ class ErfNet(nn.Module):
                 c = int(fields[0])
             elif kind == "nb":
                 modules.append(NonBottleneck1d(c, pair(fields[0]), dropout))
-            elif kind == "up":
+            elif kind == "conv":
+                modules.append(Conv(c, int(fields[0]), pair(fields[1])))
+                c = int(fields[0])
+            elif kind == "grow":
                 if not self.encoder_length:
                     self.encoder_length = len(modules)
                     self.coarse_channels = c
-                modules.append(Up(c, int(fields[0]), pair(fields[1])))
+                modules.append(Grow(c, int(fields[0]), pair(fields[1]), pair(fields[2])))
                 c = int(fields[0])
-            elif kind == "out":
-                modules.append(Out(c, int(fields[0]), pair(fields[1]), pair(fields[2])))
+            elif kind == "last":
+                modules.append(Last(c, int(fields[0]), pair(fields[1]), pair(fields[2])))
             else:
                 modules.append(nn.Identity())
         self.layers = nn.ModuleList(modules)
@@ -221,7 +238,7 @@ class ErfNet(nn.Module):
             if hasattr(layer, "export"):
                 for name, value in layer.export().items():
                     tensors[f"{i:02d}.{name}"] = value.detach().cpu().float().numpy()
-        metadata = {"format": "dendro_erfnet_1", "input": "dendro_range_planes_1",
+        metadata = {"format": "dendro_erfnet_1", "input": "dendro_range_planes_2",
                     "input_channels": str(PLANES), "classes": ",".join(CLASSES),
                     "layers": self.spec}
         return tensors, metadata
@@ -276,7 +293,7 @@ def load_exported(path):
         for i, layer in enumerate(net.layers):
             def get(name):
                 return torch.from_numpy(tensors[f"{i:02d}.{name}"].copy())
-            if isinstance(layer, (Stem, Up)):
+            if isinstance(layer, (Stem, Grow)):
                 layer.conv.weight.copy_(get("conv.weight"))
                 identity(layer.bn, shift=get("conv.bias"))
             elif isinstance(layer, Down):
@@ -291,7 +308,7 @@ def load_exported(path):
                 for k, bn in ((2, layer.bn1), (4, layer.bn2)):
                     getattr(layer, f"conv{k}").weight.copy_(get(f"conv{k}.weight"))
                     identity(bn, shift=get(f"conv{k}.bias"))
-            elif isinstance(layer, Out):
+            elif isinstance(layer, Last):
                 layer.conv.weight.copy_(get("conv.weight"))
                 layer.conv.bias.copy_(get("conv.bias"))
     return net.eval()
@@ -307,7 +324,7 @@ class Dataset:
         self.planes, self.labels, self.scans, self.seeds = [], [], [], []
         for folder in sorted(folders):
             meta = json.loads((folder / "meta.json").read_text())
-            if meta["planes"] != PLANES or meta["input"] != "dendro_range_planes_1":
+            if meta["planes"] != PLANES or meta["input"] != "dendro_range_planes_2":
                 raise SystemExit(f"train_segmentation: {folder} holds other planes; simulate anew")
             self.rows, self.cols = meta["rows"], meta["cols"]
             shape = (meta["count"], PLANES, self.rows, self.cols)
@@ -335,6 +352,7 @@ def augment(x, y, rng):
     if rng.random() < 0.5:
         x, y, mask = x[:, :, ::-1].copy(), y[:, ::-1].copy(), mask[:, ::-1].copy()
         # The step to the next column becomes the step from it.
+        x[SIDE] *= -1.0
         step = x[LATERAL].copy()
         x[LATERAL, :, :-1] = np.where(mask[:, 1:], -step[:, 1:], 1.0)
         x[LATERAL, :, :-1][~mask[:, :-1]] = 0.0
@@ -363,7 +381,7 @@ def augment(x, y, rng):
         x[RISE][below & mask] = 0.0
         x[:, drop] = 0.0
         y = np.where(drop, IGNORE, y).astype(np.uint8)
-    if rng.random() < 0.3:
+    if rng.random() < 0.15:
         x[INTENSITY] = -0.5 * mask
     else:
         gain = np.exp(rng.uniform(-0.4, 0.4))
@@ -371,6 +389,7 @@ def augment(x, y, rng):
     if rng.random() < 0.1:
         x[HEIGHT] = 0.0
         x[UP] = 0.0
+        x[SIDE] = 0.0
     return x, y
 
 
@@ -398,15 +417,22 @@ def batches(data, rng, steps, size, width):
 CLASS_WEIGHT = torch.tensor([0.6, 1.6, 1.0, 1.0])
 
 
-def fine_loss(logits, target):
+FAR = 0.5 * np.log2(8.0 / 4.0)  # Plane RANGE at 8 m.
+
+
+def fine_loss(logits, target, x):
+    """Weighted cross-entropy and the soft intersection over union of wood, the score that counts."""
     ce = F.cross_entropy(logits, torch.where(target == IGNORE, -100, target),
-                         weight=CLASS_WEIGHT.to(logits.device))
-    # Soft intersection over union of wood, the score that counts.
+                         weight=CLASS_WEIGHT.to(logits.device), reduction="none")
     valid = (target != IGNORE).float()
     wood = (target == WOOD).float()
+    # Far returns are few, but what is found far away is found early: they count half as much again.
+    weight = valid * (1.0 + 0.5 * (x[:, RANGE] > FAR))
+    total = (weight * CLASS_WEIGHT.to(logits.device)[torch.where(target == IGNORE, 0, target)]).sum()
     p = logits.softmax(1)[:, WOOD] * valid
     both = (p * wood).sum()
-    return ce + 0.5 * (1.0 - (both + 1.0) / (p.sum() + wood.sum() - both + 1.0))
+    return ((weight * ce).sum() / total.clamp_min(1.0)
+            + 0.5 * (1.0 - (both + 1.0) / (p.sum() + wood.sum() - both + 1.0)))
 
 
 def coarse_loss(logits, target):
@@ -477,6 +503,26 @@ class Average:
                 self.state[k].copy_(v)
 
 
+def bfloat16_is_faster(args, device):
+    """Times both on a network thrown away; without hardware support bfloat16 is far slower."""
+    if device.type != "cpu":
+        return False
+    seconds = []
+    for enabled in (False, True):
+        net = ErfNet(args.layers).to(memory_format=torch.channels_last)
+        x = torch.randn(args.batch, PLANES, 16, args.width).to(memory_format=torch.channels_last)
+        y = torch.randint(0, len(CLASSES), (args.batch, 16, args.width))
+        times = []
+        for _ in range(4):
+            start = time.process_time()
+            with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+                logits = net(x)
+            fine_loss(logits.float(), y, x).backward()
+            times.append(time.process_time() - start)
+        seconds.append(min(times[1:]))
+    return seconds[1] < 0.9 * seconds[0]
+
+
 def freeze_encoder(net, frozen):
     for module in net.encoder_modules():
         module.requires_grad_(not frozen)
@@ -488,8 +534,12 @@ def train(args):
     torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    args.device = "a GPU" if device.type == "cuda" else f"{args.threads} CPU core(s)"
     training, held_out = Dataset(finished(args.data, "train_*")), Dataset(finished(args.data, "held_out"))
-    net = ErfNet(args.layers).to(device)
+    net = ErfNet(args.layers).to(device, memory_format=torch.channels_last)
+    if args.bfloat16 is None:
+        args.bfloat16 = bfloat16_is_faster(args, device)
+    print(f"training on {device.type} in {'bfloat16' if args.bfloat16 else 'float32'}", flush=True)
     phases = [("encoder", args.encoder_epochs), ("decoder", args.decoder_epochs),
               ("joint", args.joint_epochs)]
     total = sum(n for _, n in phases)
@@ -517,7 +567,7 @@ def train(args):
             freeze_encoder(net, phase == "decoder")
             parameters = [p for p in net.parameters() if p.requires_grad]
             optimizer = torch.optim.AdamW(parameters, lr=1e-3, weight_decay=1e-3)
-            average = Average(net, 0.995)
+            average = Average(net, 0.998)
             if saved is not None and epoch != begin:
                 optimizer.load_state_dict(saved["optimizer"])
                 average.state, average.steps = saved["average"], saved["average_steps"]
@@ -528,15 +578,28 @@ def train(args):
         peak = {"encoder": 2e-3, "decoder": 2e-3, "joint": args.joint_rate}[phase]
         net.train()
         freeze_encoder(net, phase == "decoder")
+        if phase != "joint":
+            state["joint_from"] = 0.0
+        elif epoch == begin:
+            state["joint_from"] = state["seconds"]
         started, losses = time.time(), []
         for step, (x, y) in enumerate(batches(training, rng, args.steps, args.batch, args.width)):
-            progress = (epoch - begin + step / args.steps) / length
-            warm = min(1.0, (progress * length * args.steps + 1) / 100.0)
+            done = epoch - begin + step / args.steps
+            warm = min(1.0, (done * args.steps + 1) / 100.0)
+            progress = done / length
+            if args.minutes and phase == "joint":
+                # On a time budget the rate falls with the time that is used up.
+                used = state["seconds"] + time.time() - started
+                budget = 60.0 * args.minutes - state["joint_from"]
+                progress = max(progress, min(1.0, (used - state["joint_from"]) / budget))
             rate = peak * warm * (0.5 + 0.5 * np.cos(np.pi * progress)) + 1e-5
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            x, y = x.to(device), y.to(device)
-            loss = coarse_loss(net.coarse(x), y) if phase == "encoder" else fine_loss(net(x), y)
+            x, y = x.to(device, memory_format=torch.channels_last), y.to(device)
+            with torch.autocast(device.type, torch.bfloat16, enabled=args.bfloat16):
+                logits = net.coarse(x) if phase == "encoder" else net(x)
+            logits = logits.float()
+            loss = coarse_loss(logits, y) if phase == "encoder" else fine_loss(logits, y, x)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(net.parameters(), 5.0)
@@ -547,7 +610,8 @@ def train(args):
         state["epoch"] += 1
         line = {"epoch": state["epoch"], "phase": phase, "loss": round(float(np.mean(losses)), 4),
                 "minutes": round(state["seconds"] / 60, 1)}
-        if phase != "encoder" and (state["epoch"] % args.score_every == 0 or state["epoch"] == total):
+        if phase != "encoder" and (state["epoch"] % args.score_every == 0 or state["epoch"] == total
+                                   or (args.minutes and state["seconds"] > 60 * args.minutes)):
             smooth = ErfNet(args.layers).to(device)
             smooth.load_state_dict(average.state)
             line.update(evaluate(smooth, held_out, picture)["all"])
@@ -570,7 +634,7 @@ def train(args):
                     "average_steps": average.steps}, temporary)
         os.replace(temporary, checkpoint)
         if args.minutes and state["seconds"] > 60 * args.minutes:
-            print("time is up; --resume goes on", flush=True)
+            print("the time is used up", flush=True)
             break
     best = ErfNet(args.layers)
     best.load_state_dict(state["best_state"])
@@ -598,7 +662,7 @@ def write_card(args, training, held_out, net, state, scores):
         phases[line["phase"]] = phases.get(line["phase"], 0) + 1
     text = f"""# Model card: {args.output.name}
 
-Wood, ground, leaf and other in a VLP-16 range image. Written by `scripts/train_segmentation.py`.
+Wood, ground, leaf and other in a range image. Written by `scripts/train_segmentation.py`.
 
 - Date: {datetime.date.today().isoformat()}
 - Command: `scripts/train_segmentation.py {' '.join(args.command)}`
@@ -609,7 +673,7 @@ Wood, ground, leaf and other in a VLP-16 range image. Written by `scripts/train_
   held out (scene seeds from {held_out.seeds[0]}, other scenes), {training.rows} x {training.cols}, by `simulate_training_scans`
 - Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.batch} crops
   {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
-  {state['seconds'] / 60:.0f} min on {args.threads} CPU core(s) or a GPU
+  {'bfloat16' if args.bfloat16 else 'float32'}, {state['seconds'] / 60:.0f} min on {args.device}
 - Augmentation: yaw (place of the crop), mirror, range scale, drop-out, intensity gain and off, ground unknown
 - Early stopping: the weights with the best wood IoU on a part of the held-out scans ({state['best']:.4f})
 
@@ -619,8 +683,9 @@ Wood, ground, leaf and other in a VLP-16 range image. Written by `scripts/train_
 
 ## Limits
 
-No real scan was used. Reflectivities are drawn at random, so intensity is a weak hint only. The
-simulator's leaves are discs and its bark is smooth. Poles and posts look like wood.
+No real scan was used. Reflectivities are drawn at random, half of the scenes within what bark and leaves
+reflect in the near infrared. The simulator's leaves are discs and its bark is smooth. Poles and posts
+look like wood, and twigs thinner than the beam among leaves look like leaves.
 """
     args.output.with_suffix(".md").write_text(text)
 
@@ -660,7 +725,7 @@ def simulate(args):
     for name, count, seed in jobs:
         print(f"simulating {count} scans into {args.data / name}", flush=True)
         running.append(subprocess.Popen([str(program), "-o", str(args.data / name), "--scans",
-                                         str(count), "--seed", str(seed)]))
+                                         str(count), "--seed", str(seed)] + args.projector))
         if len(running) == args.threads:
             if running.pop(0).wait():
                 raise SystemExit("train_segmentation: the simulation failed")
@@ -670,25 +735,29 @@ def simulate(args):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=pathlib.Path, default=ROOT / "output/segmentation_data",
+    parser.add_argument("--image", choices=["16x1800", "32x360"], default="16x1800",
+                        help="a VLP-16's own, or the thesis'")
+    parser.add_argument("--data", type=pathlib.Path,
                         help="folder of the simulated scans and the checkpoint")
-    parser.add_argument("--output", type=pathlib.Path,
-                        default=ROOT / "config/models/erfnet_wood.safetensors")
-    parser.add_argument("--train-scans", type=int, default=900)
-    parser.add_argument("--folders", type=int, default=6, help="that the training scans are spread over")
-    parser.add_argument("--test-scans", type=int, default=120)
+    parser.add_argument("--output", type=pathlib.Path, help="default: config/models/")
+    parser.add_argument("--train-scans", type=int, default=2400)
+    parser.add_argument("--folders", type=int, default=4, help="that the training scans are spread over")
+    parser.add_argument("--test-scans", type=int, default=192)
     parser.add_argument("--held-out-scans", type=int, default=40, help="scored during the training")
-    parser.add_argument("--layers", default=LAYERS)
-    parser.add_argument("--encoder-epochs", type=int, default=6)
-    parser.add_argument("--decoder-epochs", type=int, default=6)
-    parser.add_argument("--joint-epochs", type=int, default=60)
+    parser.add_argument("--layers")
+    parser.add_argument("--encoder-epochs", type=int, default=4)
+    parser.add_argument("--decoder-epochs", type=int, default=4)
+    parser.add_argument("--joint-epochs", type=int, default=300)
     parser.add_argument("--joint-rate", type=float, default=2e-3, help="peak learning rate of the joint step")
-    parser.add_argument("--steps", type=int, default=150, help="per epoch")
+    parser.add_argument("--steps", type=int, default=100, help="per epoch")
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--width", type=int, default=320, help="columns of a crop, a multiple of 8")
-    parser.add_argument("--score-every", type=int, default=3, help="epochs")
-    parser.add_argument("--patience", type=int, default=12, help="scores without a better one")
-    parser.add_argument("--minutes", type=float, default=0, help="stop after this long, 0: never")
+    parser.add_argument("--score-every", type=int, default=5, help="epochs")
+    parser.add_argument("--patience", type=int, default=20, help="scores without a better one")
+    parser.add_argument("--minutes", type=float, default=0,
+                        help="of training at most, the learning rate falls accordingly; 0: no limit")
+    parser.add_argument("--bfloat16", action=argparse.BooleanOptionalAction, default=None,
+                        help="default: if it is faster on this CPU")
     parser.add_argument("--threads", type=int, default=max(1, os.cpu_count() or 1))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--checkpoint", default="checkpoint.pt")
@@ -697,6 +766,12 @@ def main():
     parser.add_argument("--fixture", type=pathlib.Path, metavar="DIR")
     args = parser.parse_args()
     args.command = sys.argv[1:]
+    native = args.image == "16x1800"
+    suffix = "" if native else "_" + args.image
+    args.data = args.data or ROOT / f"output/segmentation_data{suffix}"
+    args.output = args.output or ROOT / f"config/models/erfnet_wood{suffix}.safetensors"
+    args.layers = args.layers or (LAYERS if native else LAYERS_32X360)
+    args.projector = [] if native else ["--model", "uniform", "--rows", "32", "--cols", "360"]
     if args.fixture:
         write_fixture(args.fixture)
         return

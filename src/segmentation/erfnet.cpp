@@ -7,6 +7,7 @@
 #include <stdexcept>
 
 #include <fmt/format.h>
+#include <opencv2/core/utility.hpp>
 #include <opencv2/dnn.hpp>
 
 namespace dendro {
@@ -35,6 +36,66 @@ int ToInt(const std::string& text) {
   return value;
 }
 
+// Lays the channels of a map out as pixels: channel (c * stride_h + i) * stride_w + j becomes rows
+// i, i + stride_h, ... and columns j, j + stride_w, ... of channel c (PyTorch's PixelShuffle with a
+// stride per axis). OpenCV can do it with Reshape and a five-dimensional Permute, at several times
+// the cost of the convolution before it.
+class InterleaveLayer : public cv::dnn::Layer {
+ public:
+  explicit InterleaveLayer(const cv::dnn::LayerParams& params)
+      : stride_h_(params.get<int>("stride_h")), stride_w_(params.get<int>("stride_w")) {
+    setParamsFrom(params);
+  }
+  static cv::Ptr<cv::dnn::Layer> Create(cv::dnn::LayerParams& params) {
+    return cv::makePtr<InterleaveLayer>(params);
+  }
+  bool getMemoryShapes(const std::vector<cv::dnn::MatShape>& inputs,
+                       int /*required_outputs*/,
+                       std::vector<cv::dnn::MatShape>& outputs,
+                       std::vector<cv::dnn::MatShape>& /*internals*/) const override {
+    const cv::dnn::MatShape& in = inputs.at(0);
+    outputs.assign(1, {in[0], in[1] / (stride_h_ * stride_w_), in[2] * stride_h_, in[3] * stride_w_});
+    return false;  // Not in place.
+  }
+  void forward(cv::InputArrayOfArrays inputs,
+               cv::OutputArrayOfArrays outputs,
+               cv::OutputArrayOfArrays /*internals*/) override {
+    std::vector<cv::Mat> in;
+    std::vector<cv::Mat> out;
+    inputs.getMatVector(in);
+    outputs.getMatVector(out);
+    const int height = in[0].size[2];
+    const int width = in[0].size[3];
+    const float* from = in[0].ptr<float>();
+    const int channels = out[0].size[1];
+    for (int c = 0; c < channels; ++c) {
+      for (int i = 0; i < stride_h_; ++i) {
+        for (int j = 0; j < stride_w_; ++j) {
+          for (int y = 0; y < height; ++y, from += width) {
+            float* to = out[0].ptr<float>(0, c) +
+                        static_cast<std::ptrdiff_t>(y * stride_h_ + i) * width * stride_w_ + j;
+            for (int x = 0; x < width; ++x) to[static_cast<std::ptrdiff_t>(x) * stride_w_] = from[x];
+          }
+        }
+      }
+    }
+  }
+
+ private:
+  int stride_h_, stride_w_;
+};
+
+constexpr const char* kInterleave = "DendroInterleave";
+
+void RegisterInterleave() {
+  // OpenCV's table of layer types is global and guards itself; a type may be registered once.
+  static const bool registered = [] {
+    cv::dnn::LayerFactory::registerLayer(kInterleave, InterleaveLayer::Create);
+    return true;
+  }();
+  static_cast<void>(registered);
+}
+
 // Adds layers to a cv::dnn::Net one by one and keeps track of which tensors were used.
 class Builder {
  public:
@@ -54,6 +115,13 @@ class Builder {
   }
 
   int Relu(const std::string& name, int input) { return Add(name, "ReLU", {}, {input}); }
+
+  int Interleave(const std::string& name, int input, int stride_h, int stride_w) {
+    cv::dnn::LayerParams params;
+    params.set("stride_h", stride_h);
+    params.set("stride_w", stride_w);
+    return Add(name, kInterleave, params, {input});
+  }
 
   struct Window {
     int kernel_h = 1, kernel_w = 1, stride_h = 1, stride_w = 1, pad_h = 0, pad_w = 0;
@@ -79,21 +147,6 @@ class Builder {
     params.blobs.push_back(Blob(name + ".weight", {out, in, window.kernel_h, window.kernel_w}));
     params.blobs.push_back(Blob(name + ".bias", {out}));
     return Add(name, "Convolution", params, {input});
-  }
-
-  int Deconvolution(const std::string& name, int input, int in, int out, Window window) {
-    // So much padding that the output is exactly stride times the input.
-    window.pad_h = (window.kernel_h - window.stride_h + 1) / 2;
-    window.pad_w = (window.kernel_w - window.stride_w + 1) / 2;
-    cv::dnn::LayerParams params;
-    SetWindow(window, &params);
-    params.set("adj_h", window.stride_h - window.kernel_h + 2 * window.pad_h);
-    params.set("adj_w", window.stride_w - window.kernel_w + 2 * window.pad_w);
-    params.set("num_output", out);
-    params.set("bias_term", true);
-    params.blobs.push_back(Blob(name + ".weight", {in, out, window.kernel_h, window.kernel_w}));
-    params.blobs.push_back(Blob(name + ".bias", {out}));
-    return Add(name, "Deconvolution", params, {input});
   }
 
   int Pool(const std::string& name, int input, int channels, int stride_h, int stride_w) {
@@ -162,18 +215,21 @@ std::vector<ErfNetLayer> ParseErfNetLayers(const std::string& text, const std::s
       layer.channels = ToInt(fields[1]);
       if (layer.channels < 1 || layer.channels > kMaxChannels) fail("has a bad channel count");
     };
-    if (layer.type == "stem" || layer.type == "out") {
+    const auto want_odd_kernel = [&]() {
+      if (layer.kernel_h % 2 == 0 || layer.kernel_w % 2 == 0) fail("needs an odd kernel");
+    };
+    if (layer.type == "stem" || layer.type == "grow" || layer.type == "last") {
       want(4);
       channels();
       pair(2, &layer.kernel_h, &layer.kernel_w, 9);
       pair(3, &layer.stride_h, &layer.stride_w, 2);
-      if (layer.type == "stem" && (layer.kernel_h % 2 == 0 || layer.kernel_w % 2 == 0)) {
-        fail("needs an odd kernel");
-      }
-      if (layer.kernel_h < layer.stride_h || layer.kernel_w < layer.stride_w) {
-        fail("has a kernel smaller than its stride");
-      }
-    } else if (layer.type == "down" || layer.type == "up") {
+      want_odd_kernel();
+    } else if (layer.type == "conv") {
+      want(3);
+      channels();
+      pair(2, &layer.kernel_h, &layer.kernel_w, 9);
+      want_odd_kernel();
+    } else if (layer.type == "down") {
       want(3);
       channels();
       pair(2, &layer.stride_h, &layer.stride_w, 2);
@@ -205,7 +261,8 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
   if (input_channels_ < 1 || input_channels_ > 64) fail("has a bad input_channels");
   const std::vector<ErfNetLayer> layers =
       ParseErfNetLayers(weights.Metadata("layers"), weights.name());
-  if (layers.empty() || layers.back().type != "out") fail("does not end in an 'out' layer");
+  if (layers.empty() || layers.back().type != "last") fail("does not end in a 'last' layer");
+  RegisterInterleave();
 
   struct Shape {
     int id, channels, scale_h, scale_w;  // Scale: how many input pixels one pixel stands for.
@@ -223,7 +280,7 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
     window.stride_w = layer.stride_w;
     window.pad_h = layer.kernel_h / 2;
     window.pad_w = layer.kernel_w / 2;
-    if (layer.type == "stem") {
+    if (layer.type == "stem" || layer.type == "conv") {
       const int conv =
           builder.Convolution(name + ".conv", at.id, at.channels, layer.channels, window);
       at = {builder.Relu(name + ".relu", conv), layer.channels, at.scale_h * layer.stride_h,
@@ -275,12 +332,16 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
       sum.set("operation", "sum");
       at.id = builder.Add(name + ".add", "Eltwise", sum, {at.id, kept.back().id});
       kept.pop_back();
-    } else {  // up, out
+    } else {  // grow, last
       if (at.scale_h % layer.stride_h != 0 || at.scale_w % layer.stride_w != 0) {
         fail(fmt::format("layer {} enlarges past the input", i));
       }
-      int id = builder.Deconvolution(name + ".conv", at.id, at.channels, layer.channels, window);
-      if (layer.type == "up") id = builder.Relu(name + ".relu", id);
+      const int copies = layer.stride_h * layer.stride_w;
+      window.stride_h = window.stride_w = 1;
+      int id =
+          builder.Convolution(name + ".conv", at.id, at.channels, layer.channels * copies, window);
+      if (layer.type == "grow") id = builder.Relu(name + ".relu", id);
+      if (copies > 1) id = builder.Interleave(name + ".pixels", id, layer.stride_h, layer.stride_w);
       at = {id, layer.channels, at.scale_h / layer.stride_h, at.scale_w / layer.stride_w};
     }
     row_multiple_ = std::max(row_multiple_, at.scale_h);
@@ -315,6 +376,17 @@ std::vector<float> ErfNet::Forward(const std::vector<float>& planes, int rows, i
   // forward() returns memory that the next call overwrites: copy.
   const float* values = output.ptr<float>();
   return std::vector<float>(values, values + pixels * static_cast<std::size_t>(classes_));
+}
+
+std::vector<std::pair<std::string, double>> ErfNet::LayerMilliseconds() {
+  std::vector<double> ticks;
+  impl_->net.getPerfProfile(ticks);
+  const std::vector<cv::String> names = impl_->net.getLayerNames();
+  std::vector<std::pair<std::string, double>> times;
+  for (std::size_t i = 0; i < names.size() && i < ticks.size(); ++i) {
+    times.emplace_back(names[i], 1e3 * ticks[i] / cv::getTickFrequency());
+  }
+  return times;
 }
 
 }  // namespace dendro

@@ -32,7 +32,12 @@ std::vector<float> NetworkInput(const RangeImage& image,
       out[2 * plane] = image.intensity[pixel] / 128.0F - 0.5F;
       if (ground) {
         out[3 * plane] = std::clamp(0.5F * ground->Height(p), -1.0F, 3.0F);
-        out[4 * plane] = ground->normal.dot(image.beam_direction[pixel]);
+        const Eigen::Vector3f& beam = image.beam_direction[pixel];
+        out[4 * plane] = ground->normal.dot(beam);
+        // Columns go clockwise seen from above.
+        const float horizontal = std::max(Horizontal(beam), 1e-3F);
+        out[8 * plane] =
+            (ground->normal.x() * beam.y() - ground->normal.y() * beam.x()) / horizontal;
       }
       const std::size_t next = image.Index(row, image.WrapColumn(columns[c] + 1));
       out[5 * plane] = has(next) ? Squash(image.range[next] - range, 0.1F) : 1.0F;

@@ -1,6 +1,7 @@
 #include "dendro_slam/segmentation/wood_segmenter.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <fstream>
 #include <optional>
@@ -17,8 +18,13 @@
 namespace dendro {
 namespace {
 
-constexpr const char* kWeightsName = "erfnet_wood.safetensors";
-constexpr const char* kInputVersion = "dendro_range_planes_1";
+struct ShippedWeights {
+  const char* name;
+  int rows, cols;  // Of the images they were trained on.
+};
+constexpr std::array<ShippedWeights, 2> kShippedWeights = {
+    {{"erfnet_wood.safetensors", 16, 1800}, {"erfnet_wood_32x360.safetensors", 32, 360}}};
+constexpr const char* kInputVersion = "dendro_range_planes_2";
 constexpr const char* kClassList = "ground,wood,leaf,other";
 constexpr int kClasses = 4;
 constexpr int kWoodClass = 1;
@@ -57,18 +63,56 @@ void WoodSegmenterConfig::Validate() const {
   geometric.Validate();
 }
 
-std::string ShippedWoodWeights() {
+std::string ShippedWoodWeights(int rows, int cols) {
+  // How many times as fine or coarse, summed over both axes in logarithm.
+  const auto unlike = [&](const ShippedWeights& weights) {
+    return std::abs(std::log(std::max(rows, 1) / static_cast<double>(weights.rows))) +
+           std::abs(std::log(std::max(cols, 1) / static_cast<double>(weights.cols)));
+  };
+  const ShippedWeights& best = *std::min_element(
+      kShippedWeights.begin(), kShippedWeights.end(),
+      [&](const ShippedWeights& a, const ShippedWeights& b) { return unlike(a) < unlike(b); });
   for (const char* folder : {DENDRO_SOURCE_MODELS, DENDRO_INSTALLED_MODELS}) {
-    const std::string path = std::string(folder) + "/" + kWeightsName;
+    const std::string path = std::string(folder) + "/" + best.name;
     if (std::ifstream(path)) return path;
   }
-  throw WeightsError(fmt::format("weights file '{}' is neither in {} nor in {}", kWeightsName,
+  throw WeightsError(fmt::format("weights file '{}' is neither in {} nor in {}", best.name,
                                  DENDRO_SOURCE_MODELS, DENDRO_INSTALLED_MODELS));
 }
+
+namespace {
+
+ErfNet LoadNetwork(const std::string& path) {
+  const TensorFile weights = TensorFile::Load(path);
+  if (weights.Metadata("input") != kInputVersion || weights.Metadata("classes") != kClassList) {
+    throw WeightsError(fmt::format("weights file '{}': was trained for another input or other "
+                                   "classes", weights.name()));
+  }
+  ErfNet net(weights);
+  if (net.input_channels() != kNetworkInputChannels || net.classes() != kClasses) {
+    throw WeightsError(fmt::format("weights file '{}': wants {} input planes and has {} classes, "
+                                   "expected {} and {}", weights.name(), net.input_channels(),
+                                   net.classes(), kNetworkInputChannels, kClasses));
+  }
+  return net;
+}
+
+}  // namespace
 
 struct WoodSegmenter::Impl {
   WoodSegmenterConfig config;
   std::optional<ErfNet> net;
+  std::string net_path;  // Where `net` came from.
+  int last_rows = 0, last_cols = 0;  // Of the image that `net` was chosen for.
+
+  // Shipped weights follow the size of the image.
+  void ChooseNetwork(int rows, int cols) {
+    if (!config.weights.empty()) return;
+    const std::string path = ShippedWoodWeights(rows, cols);
+    if (path == net_path) return;
+    net.emplace(LoadNetwork(path));
+    net_path = path;
+  }
 
   bool InRange(const RangeImage& image, std::size_t pixel) const {
     return image.HasReturn(pixel) &&
@@ -197,19 +241,8 @@ WoodSegmenter::WoodSegmenter(const WoodSegmenterConfig& config) : impl_(std::mak
   config.Validate();
   impl_->config = config;
   if (config.method != "network") return;
-  const TensorFile weights =
-      TensorFile::Load(config.weights.empty() ? ShippedWoodWeights() : config.weights);
-  if (weights.Metadata("input") != kInputVersion || weights.Metadata("classes") != kClassList) {
-    throw WeightsError(fmt::format("weights file '{}': was trained for another input or other "
-                                   "classes", weights.name()));
-  }
-  impl_->net.emplace(weights);
-  if (impl_->net->input_channels() != kNetworkInputChannels || impl_->net->classes() != kClasses) {
-    throw WeightsError(fmt::format("weights file '{}': wants {} input planes and has {} classes, "
-                                   "expected {} and {}", weights.name(),
-                                   impl_->net->input_channels(), impl_->net->classes(),
-                                   kNetworkInputChannels, kClasses));
-  }
+  impl_->net_path = config.weights.empty() ? ShippedWoodWeights() : config.weights;
+  impl_->net.emplace(LoadNetwork(impl_->net_path));
 }
 
 WoodSegmenter::~WoodSegmenter() = default;
@@ -248,6 +281,12 @@ LabelledScan WoodSegmenter::Segment(RangeImage image) {
   }
   for (std::size_t i = 0; i < n; ++i) {
     if (scan.image.HasReturn(i)) scan.label[i] = default_label(i);
+  }
+  if (n == 0) return scan;
+  if (scan.image.rows != impl_->last_rows || scan.image.cols != impl_->last_cols) {
+    impl_->ChooseNetwork(scan.image.rows, scan.image.cols);
+    impl_->last_rows = scan.image.rows;
+    impl_->last_cols = scan.image.cols;
   }
   impl_->RunNetwork(&scan, ground);
   return scan;

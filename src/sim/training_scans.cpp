@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <random>
 #include <stdexcept>
 
@@ -41,14 +42,22 @@ class Random {
 
 void AddTrees(const std::string& kind, Random& rng, Scene* scene) {
   const bool thesis = kind == "thesis";
-  const bool leafy = kind == "leafy";
-  const int wanted = thesis ? rng.Integer(1, 2) : rng.Integer(1, 5);
+  const bool orchard = kind == "orchard";
+  const bool leafy = kind == "leafy" || (orchard && rng.Chance(0.7));
+  const int wanted = thesis ? rng.Integer(1, 2) : orchard ? rng.Integer(4, 8) : rng.Integer(1, 5);
+  const double spacing = rng.Uniform(2.0, 4.5);
   const double area = thesis ? 5.0 : rng.Uniform(5.0, 12.0);
   std::vector<Eigen::Vector2d> places;
   for (int attempt = 0; attempt < 50 && static_cast<int>(places.size()) < wanted; ++attempt) {
-    const Eigen::Vector2d place(rng.Uniform(-area / 2, area / 2), rng.Uniform(-area / 2, area / 2));
+    Eigen::Vector2d place(rng.Uniform(-area / 2, area / 2), rng.Uniform(-area / 2, area / 2));
+    if (orchard) {  // One or two rows.
+      const int k = static_cast<int>(places.size());
+      place = Eigen::Vector2d((k / (wanted > 5 ? 2 : 1)) * spacing + 0.2 * rng.Gaussian(),
+                              (wanted > 5 ? k % 2 : 0) * 1.4 * spacing + 0.2 * rng.Gaussian());
+    }
+    const double apart = orchard ? 0.6 * spacing : 2.5;
     const bool free = std::all_of(places.begin(), places.end(), [&](const Eigen::Vector2d& other) {
-      return (other - place).norm() > 2.5;
+      return (other - place).norm() > apart;
     });
     if (!free) continue;
     places.push_back(place);
@@ -61,16 +70,24 @@ void AddTrees(const std::string& kind, Random& rng, Scene* scene) {
       config.max_order = 1;
       config.min_radius_m = 0.02;
       config.leaf_count = 0;
-    } else if (leafy) {
+    } else if (leafy && !(orchard && rng.Chance(0.2))) {
       // Few trees are so dense that hardly any wood is seen: draw the density evenly in logarithm.
       config.leaf_count = static_cast<int>(std::exp(rng.Uniform(std::log(600.0), std::log(20000.0))));
-      config.leaf_size_m = rng.Uniform(0.03, 0.12);
+      config.leaf_size_m = std::exp(rng.Uniform(std::log(0.02), std::log(0.12)));
     } else {
       config.leaf_count = 0;
+    }
+    if (orchard) {
+      config.height_m = rng.Uniform(2.5, 6.0);
+      config.dbh_m = std::clamp(config.height_m * rng.Uniform(0.02, 0.055), 0.06, 0.4);
     }
     const double z = GroundHeight(scene->ground, place.x(), place.y());
     SceneTree tree =
         GenerateTree(config, Eigen::Vector3d(place.x(), place.y(), z - 0.05), rng.Seed());
+    if (config.leaf_count > 0) {
+      tree.leaves.spread_m = rng.Uniform(0.05, 0.2);
+      tree.leaves.max_wood_radius_m *= rng.Uniform(0.5, 1.6);
+    }
     tree.name = fmt::format("tree_{}", places.size());
     scene->trees.push_back(std::move(tree));
   }
@@ -98,7 +115,8 @@ void AddGrass(Random& rng, Scene* scene) {
   }
 }
 
-void AddObstacles(bool clutter, Random& rng, Scene* scene) {
+void AddObstacles(const std::string& kind, Random& rng, Scene* scene) {
+  const bool clutter = kind == "clutter";
   const auto add = [&](const Eigen::Vector3d& size, double reach, double least) {
     // Not on top of a trunk.
     for (int attempt = 0; attempt < 20; ++attempt) {
@@ -122,6 +140,12 @@ void AddObstacles(bool clutter, Random& rng, Scene* scene) {
     }
   };
   if (scene->ground.type == SceneGround::Type::kNone) return;
+  if (kind == "orchard" && rng.Chance(0.3)) {  // Trellis posts.
+    for (int i = rng.Integer(1, 4); i > 0; --i) {
+      const double side = rng.Uniform(0.06, 0.16);
+      add({side, side, rng.Uniform(1.5, 3.0)}, 9.0, 1.0);
+    }
+  }
   for (int i = rng.Integer(0, 6); i > 0; --i) {  // Rocks.
     const double s = rng.Uniform(0.15, 0.8);
     add({s * rng.Uniform(0.6, 1.4), s * rng.Uniform(0.6, 1.4), s * rng.Uniform(0.4, 0.9)}, 10.0, 1.0);
@@ -153,8 +177,8 @@ void AddObstacles(bool clutter, Random& rng, Scene* scene) {
 }  // namespace
 
 const std::vector<std::string>& TrainingKinds() {
-  static const std::vector<std::string> kinds = {"thesis", "leafless", "leafy", "tilted",
-                                                 "clutter"};
+  static const std::vector<std::string> kinds = {"thesis", "leafless", "leafy",
+                                                 "tilted", "clutter",  "orchard"};
   return kinds;
 }
 
@@ -167,7 +191,12 @@ Scene RandomTrainingScene(const std::string& kind, std::uint64_t seed) {
   Scene scene;
   std::string trees = kind;
   const bool clutter = kind == "clutter";
-  if (kind == "tilted" || clutter) trees = rng.Chance(0.5) ? "leafy" : rng.Chance(0.5) ? "leafless" : "thesis";
+  if (kind == "tilted" || clutter) {
+    trees = rng.Chance(0.5)   ? "leafy"
+            : rng.Chance(0.5) ? "leafless"
+            : rng.Chance(0.5) ? "thesis"
+                              : "orchard";
+  }
   if (trees == "thesis" || rng.Chance(0.25)) {
     scene.ground.type = SceneGround::Type::kPlane;
   } else if (rng.Chance(0.05)) {
@@ -189,13 +218,22 @@ Scene RandomTrainingScene(const std::string& kind, std::uint64_t seed) {
     AddTrees(trees, rng, &scene);
   }
   if (trees == "thesis") {
-    if (clutter || rng.Chance(0.3)) AddObstacles(clutter, rng, &scene);
+    if (clutter || rng.Chance(0.3)) AddObstacles(kind, rng, &scene);
   } else {
-    AddObstacles(clutter, rng, &scene);
+    AddObstacles(kind, rng, &scene);
     if (scene.ground.type != SceneGround::Type::kNone && rng.Chance(0.4)) AddGrass(rng, &scene);
   }
+  // Half of the scenes within what bark, leaves and soil reflect in the near infrared, so that
+  // brightness is a hint; a third with anything, so that it is never more than a hint.
   SceneReflectivity& r = scene.reflectivity;
-  if (rng.Chance(0.75)) {
+  const double look = rng.Uniform(0.0, 1.0);
+  if (look < 0.5) {
+    r.ground = rng.Uniform(0.15, 0.45);
+    r.trunk = rng.Uniform(0.2, 0.55);
+    r.leaf = rng.Uniform(0.38, 0.62);
+    r.obstacle = rng.Uniform(0.15, 0.8);
+    r.branch = r.trunk * rng.Uniform(0.85, 1.15);
+  } else if (look < 0.85) {
     for (double* value : {&r.ground, &r.trunk, &r.leaf, &r.obstacle}) {
       *value = rng.Uniform(0.12, 0.8);
     }
@@ -277,6 +315,7 @@ std::vector<TrainingScan> SimulateTrainingScans(const std::string& kind,
     TrainingScan scan;
     scan.image = projector.Project(simulated.scan, nullptr);
     scan.truth = PixelTruth(scan.image, simulated.truth);
+    scan.wood_radius_m = PixelWoodRadius(scan.image, simulated.truth, scene, pose);
     scan.kind = kind;
     scan.seed = seed;
     scans.push_back(std::move(scan));
@@ -291,6 +330,36 @@ std::vector<Label> PixelTruth(const RangeImage& image, const std::vector<PointTr
     labels[i] = SurfaceLabel(truth.at(static_cast<std::size_t>(image.point_index[i])).kind);
   }
   return labels;
+}
+
+std::vector<float> PixelWoodRadius(const RangeImage& image,
+                                   const std::vector<PointTruth>& truth,
+                                   const Scene& scene,
+                                   const Eigen::Isometry3d& T_map_lidar) {
+  std::vector<float> radius(image.size(), 0.0F);
+  for (std::size_t i = 0; i < image.size(); ++i) {
+    if (image.point_index[i] < 0) continue;
+    const PointTruth& t = truth.at(static_cast<std::size_t>(image.point_index[i]));
+    if (t.branch_id < 0) continue;
+    const SceneBranch* branch =
+        scene.trees.at(static_cast<std::size_t>(t.tree_id)).FindBranch(t.branch_id);
+    if (branch == nullptr) continue;
+    const Eigen::Vector3d p = T_map_lidar * image.point[i].cast<double>();
+    double nearest = std::numeric_limits<double>::infinity();
+    for (std::size_t k = 1; k < branch->points.size(); ++k) {
+      const BranchPoint& a = branch->points[k - 1];
+      const BranchPoint& b = branch->points[k];
+      const Eigen::Vector3d axis = b.position - a.position;
+      const double u =
+          std::clamp((p - a.position).dot(axis) / std::max(axis.squaredNorm(), 1e-12), 0.0, 1.0);
+      const double distance = (a.position + u * axis - p).squaredNorm();
+      if (distance < nearest) {
+        nearest = distance;
+        radius[i] = static_cast<float>(a.radius_m + u * (b.radius_m - a.radius_m));
+      }
+    }
+  }
+  return radius;
 }
 
 }  // namespace dendro

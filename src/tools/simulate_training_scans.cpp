@@ -27,12 +27,12 @@ namespace {
 struct Options {
   std::string folder;
   int scans = 100;
-  int scans_per_scene = 4;
+  int scans_per_scene = 2;
   std::uint64_t seed = 1000;
   int sub_rays_width = 5;
   int sub_rays_height = 2;
   std::string kinds =
-      "thesis,clutter,leafless,leafy,thesis,leafy,clutter,leafless,leafy,tilted,leafless,leafy";
+      "leafy,tilted,leafless,orchard,clutter,tilted,leafy,thesis,tilted,leafy,clutter,tilted";
   dendro::ProjectorConfig projector;
 };
 
@@ -88,7 +88,7 @@ void Run(const Options& options) {
   labels_file.close();
   // The description comes last: without it the folder counts as unfinished.
   std::ofstream meta(folder / "meta.json");
-  meta << nlohmann::json({{"input", "dendro_range_planes_1"},
+  meta << nlohmann::json({{"input", "dendro_range_planes_2"},
                           {"count", done},
                           {"planes", dendro::kNetworkInputChannels},
                           {"rows", options.projector.rows},
@@ -111,7 +111,7 @@ int main(int argc, char** argv) {
   app.add_option("--seed", options.seed, "Of the first scene; the next ones count up");
   app.add_option("--sub-rays-width", options.sub_rays_width)->check(CLI::Range(1, 64));
   app.add_option("--sub-rays-height", options.sub_rays_height)->check(CLI::Range(1, 64));
-  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted, clutter)");
+  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted, clutter, orchard)");
   app.add_option("--model", options.projector.model, "vlp16 or uniform");
   app.add_option("--rows", options.projector.rows);
   app.add_option("--cols", options.projector.cols);

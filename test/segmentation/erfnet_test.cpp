@@ -18,12 +18,12 @@ const std::string kData = std::string(DENDRO_SOURCE_DIR) + "/test/segmentation/d
 // normalisations have random statistics (scripts/train_segmentation.py --fixture).
 TEST(ErfNet, LogitsEqualPyTorch) {
   ErfNet net(TensorFile::Load(kData + "erfnet_fixture.safetensors"));
-  EXPECT_EQ(net.input_channels(), 8);
+  EXPECT_EQ(net.input_channels(), 9);
   EXPECT_EQ(net.classes(), 4);
   EXPECT_EQ(net.row_multiple(), 4);
-  EXPECT_EQ(net.col_multiple(), 8);
+  EXPECT_EQ(net.col_multiple(), 4);
   const TensorFile io = TensorFile::Load(kData + "erfnet_fixture_io.safetensors");
-  const Tensor& input = io.Get("input", {8, 16, 64});
+  const Tensor& input = io.Get("input", {9, 16, 64});
   const Tensor& expected = io.Get("logits", {4, 16, 64});
   const std::vector<float> logits = net.Forward(input.values, 16, 64);
   ASSERT_EQ(logits.size(), expected.values.size());
@@ -38,18 +38,18 @@ TEST(ErfNet, LogitsEqualPyTorch) {
 TEST(ErfNet, SecondPassGivesTheSameAndDoesNotTouchTheFirst) {
   ErfNet net(TensorFile::Load(kData + "erfnet_fixture.safetensors"));
   const TensorFile io = TensorFile::Load(kData + "erfnet_fixture_io.safetensors");
-  const Tensor& input = io.Get("input", {8, 16, 64});
+  const Tensor& input = io.Get("input", {9, 16, 64});
   const std::vector<float> first = net.Forward(input.values, 16, 64);
   const std::vector<float> copy = first;
-  net.Forward(std::vector<float>(8 * 16 * 128, 0.3F), 16, 128);
+  net.Forward(std::vector<float>(9 * 16 * 128, 0.3F), 16, 128);
   EXPECT_EQ(first, copy);
   EXPECT_EQ(net.Forward(input.values, 16, 64), copy);
 }
 
 TEST(ErfNet, RefusesSizesThatDoNotFit) {
   ErfNet net(TensorFile::Load(kData + "erfnet_fixture.safetensors"));
-  EXPECT_THROW(net.Forward(std::vector<float>(8 * 16 * 60), 16, 60), std::invalid_argument);
-  EXPECT_THROW(net.Forward(std::vector<float>(8 * 15 * 64), 15, 64), std::invalid_argument);
+  EXPECT_THROW(net.Forward(std::vector<float>(9 * 16 * 62), 16, 62), std::invalid_argument);
+  EXPECT_THROW(net.Forward(std::vector<float>(9 * 15 * 64), 15, 64), std::invalid_argument);
   EXPECT_THROW(net.Forward(std::vector<float>(7), 16, 64), std::invalid_argument);
 }
 
@@ -99,13 +99,15 @@ TEST_F(ErfNetRefuses, OtherFormat) {
 TEST_F(ErfNetRefuses, BadLayers) {
   for (const auto& [layers, reason] : std::map<std::string, std::string>{
            {"stem:6:3x5:1x2 twist", "unknown type"},
-           {"stem:6:3x5:1x2 add out:4:3x4:1x2", "another size"},
+           {"stem:6:3x5:1x2 add last:4:1x1:1x2", "another size"},
            {"stem:6:3x4:1x2", "odd kernel"},
            {"stem:6:3x5:1x3", "out of range"},
            {"stem:99999:3x5:1x2", "bad channel count"},
            {"stem:6:3x5", "wrong number of fields"},
-           {"stem:6:3x5:1x2", "does not end in an 'out' layer"},
-           {"", "does not end in an 'out' layer"}}) {
+           {"stem:6:3x5:1x2 last:4:2x2:1x2", "odd kernel"},
+           {"stem:6:3x5:1x2 grow:6:1x1", "wrong number of fields"},
+           {"stem:6:3x5:1x2", "does not end in a 'last' layer"},
+           {"", "does not end in a 'last' layer"}}) {
     metadata_["layers"] = layers;
     ExpectRefused(reason);
   }

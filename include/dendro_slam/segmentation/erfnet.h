@@ -2,6 +2,7 @@
 
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "dendro_slam/segmentation/safetensors.h"
@@ -16,8 +17,12 @@ namespace dendro {
 ///   `down:C:SHxSW`        ERFNet's downsampler: 3 x 3 convolution beside max pooling, ReLU
 ///   `nb:DHxDW`            ERFNet's non-bottleneck-1D block, dilation of its second half
 ///   `push`, `add`         keep a feature map; add the one kept last (the skip connection)
-///   `up:C:SHxSW`          3 x 3 transposed convolution, ReLU
-///   `out:K:KHxKW:SHxSW`   transposed convolution to the K class logits
+///   `conv:C:KHxKW`        convolution to C channels, ReLU
+///   `grow:C:KHxKW:SHxSW`  convolution to C * SH * SW channels, ReLU, then every SH * SW channels are
+///                         laid out as SH x SW pixels (sub-pixel convolution, Shi et al. 2016)
+///   `last:K:KHxKW:SHxSW`  the same without ReLU, to the K class logits
+///
+/// @note Deviates: ERFNet enlarges by transposed convolutions, which take OpenCV several times as long.
 struct ErfNetLayer {
   std::string type;
   int channels = 0;
@@ -53,6 +58,10 @@ class ErfNet {
   /// @return classes x rows x cols logits, row-major; owned by the caller.
   /// @throws std::invalid_argument if the size does not fit.
   std::vector<float> Forward(const std::vector<float>& planes, int rows, int cols);
+
+  /// Name and wall time of every layer of the last pass [ms], for benchmarks. Layers that OpenCV
+  /// fused into the one before take no time of their own.
+  std::vector<std::pair<std::string, double>> LayerMilliseconds();
 
  private:
   struct Impl;

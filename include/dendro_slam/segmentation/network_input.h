@@ -9,7 +9,7 @@
 namespace dendro {
 
 /// Number of planes the network sees per pixel.
-inline constexpr int kNetworkInputChannels = 8;
+inline constexpr int kNetworkInputChannels = 9;
 
 /// Range, position and intensity of a scan as the network's input planes, each about in [-1, 1]:
 ///
@@ -21,6 +21,8 @@ inline constexpr int kNetworkInputChannels = 8;
 ///   5 lateral     d / (|d| + 0.1 m), d the step in range to the next column
 ///   6 vertical    d / (|d| + 0.2 m), d the step in horizontal distance to the next row
 ///   7 rise        d / (|d| + 0.2 m), d the step in z to the next row
+///   8 side        component of the direction to the next column along the ground's normal: with `up`
+///                 it tells which way a stem runs through the image of a tilted sensor; 0 if no ground
 ///
 /// A step towards a missing pixel counts as infinitely far (+1, and for 7 as 0).
 ///

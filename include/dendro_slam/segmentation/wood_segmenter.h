@@ -12,7 +12,7 @@ namespace dendro {
 /// Parameters of stage 1.
 struct WoodSegmenterConfig {
   std::string method = "network";  ///< "network", or "geometric" which needs no weights.
-  std::string weights = "";        ///< Weights file; empty: the one the package ships.
+  std::string weights = "";        ///< Weights file; empty: the shipped one for about this size of image.
   double min_range_m = 0.4;        ///< Nearer returns are of the carrier: `other` [m]. >= 0.
   double max_range_m = 30.0;       ///< Farther returns are ground or other, never wood [m].
   double wood_threshold = 0.5;     ///< Wood if its probability is at least this. In (0, 1).
@@ -42,15 +42,17 @@ struct WoodSegmenterConfig {
   }
 };
 
-/// The weights the package ships, in the source tree or where it is installed.
+/// The weights the package ships for range images of about this size, in the source tree or where it
+/// is installed: `erfnet_wood` was trained on 16 x 1800, `erfnet_wood_32x360` on 32 x 360.
 /// @throws WeightsError if they are in neither place.
-std::string ShippedWoodWeights();
+std::string ShippedWoodWeights(int rows = 16, int cols = 1800);
 
 /// Stage 1: tells wood from ground, leaves and everything else in a range image.
 ///
 /// `network` runs an ERFNet (see erfnet.h) on the columns that hold something other than bare
 /// ground within range, with a margin of neighbouring columns (across azimuth 0 too). `geometric`
-/// needs no weights. Owns the network; one instance per thread.
+/// needs no weights. Owns the network; one instance per thread. A network sees patterns of pixels, so
+/// that one trained on another size of image than the scan's finds next to nothing.
 class WoodSegmenter {
  public:
   /// @throws std::invalid_argument naming a bad field; WeightsError for a bad weights file.
@@ -60,7 +62,8 @@ class WoodSegmenter {
   WoodSegmenter& operator=(WoodSegmenter&&) noexcept;
 
   /// Labels a range image; the image is moved into the result, not copied.
-  /// @throws std::invalid_argument if the image's vectors do not have rows x cols entries.
+  /// @throws std::invalid_argument if the image's vectors do not have rows x cols entries;
+  ///   WeightsError if the first image needs shipped weights that cannot be used.
   LabelledScan Segment(RangeImage image);
 
   const WoodSegmenterConfig& config() const;

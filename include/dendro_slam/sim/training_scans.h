@@ -15,6 +15,7 @@ namespace dendro {
 struct TrainingScan {
   RangeImage image;
   std::vector<Label> truth;  ///< Of the nearest return of each pixel; kNone without a return.
+  std::vector<float> wood_radius_m;  ///< Of the wood that each pixel met [m]; 0 where it met none.
   std::string kind;          ///< See TrainingKinds().
   std::uint64_t seed = 0;    ///< Of the scene.
 };
@@ -24,7 +25,8 @@ struct TrainingScan {
 ///   leafless  bare trees of all forms, rough ground, rocks, grass, walls, crates, pillars, people
 ///   leafy     the same, in leaf
 ///   tilted    any of these, the sensor mounted at a random angle, up to lying on its side
-///   clutter   any of the first three among pillars as thick as trunks, people and ends of walls
+///   orchard   one or two rows of small trees, most of them in leaf, trellis posts in some
+///   clutter   any of these, sensor upright, among pillars as thick as trunks, people and ends of walls
 const std::vector<std::string>& TrainingKinds();
 
 /// A random scene of a kind, a deterministic function of the seed. Reflectivities are drawn at
@@ -46,5 +48,13 @@ std::vector<TrainingScan> SimulateTrainingScans(const std::string& kind,
 /// The true class of every pixel of a projected scan.
 /// @param truth  Per point of the cloud that the image was projected from.
 std::vector<Label> PixelTruth(const RangeImage& image, const std::vector<PointTruth>& truth);
+
+/// The true radius of the wood that every pixel met [m], 0 where it met none: tells which twigs are
+/// too thin for the beam.
+/// @param T_map_lidar  Pose of the lidar at the image's stamp.
+std::vector<float> PixelWoodRadius(const RangeImage& image,
+                                   const std::vector<PointTruth>& truth,
+                                   const Scene& scene,
+                                   const Eigen::Isometry3d& T_map_lidar);
 
 }  // namespace dendro
