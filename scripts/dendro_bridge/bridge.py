@@ -324,7 +324,7 @@ class Bridge:
     def run(self):
         self.prepare()
         shown = 0.0
-        while not self.stopping.is_set():
+        while not self.stopping.is_set() and not rospy.is_shutdown():
             for child in self.children.values():
                 self.tend(child)
             if self.recorder and not self.ended:
