@@ -30,7 +30,7 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "scripts"))
 import train_segmentation as training  # noqa: E402
 
-PROGRAMS = ROOT / "build/devel/lib/dendro_slam"
+PROGRAMS = training.PROGRAMS
 
 
 class PlainDown(nn.Module):
@@ -130,14 +130,15 @@ def time_beside_onnx_runtime(args):
 
 def agreement(args):
     """Largest difference of a logit and share of equal labels, C++ against PyTorch."""
-    weights = args.weights or ROOT / "config/models/erfnet_wood.safetensors"
+    native = args.rows == 16
+    weights = args.weights or ROOT / f"config/models/erfnet_wood{'' if native else '_32x360'}.safetensors"
     torch.set_num_threads(1)
     net = training.load_exported(weights)
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
         subprocess.run([str(PROGRAMS / "simulate_training_scans"), "-o", str(folder / "scans"), "--scans",
                         str(args.agreement), "--seed", "6000000", "--rows", str(args.rows), "--cols",
-                        str(args.cols)] + (["--model", "uniform"] if args.rows != 16 else []), check=True)
+                        str(args.cols)] + ([] if native else ["--model", "uniform"]), check=True)
         data = training.Dataset([folder / "scans"])
         planes = np.stack(data.planes).astype(np.float32)
         planes.tofile(folder / "planes.f32")

@@ -31,6 +31,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+PROGRAMS = pathlib.Path(os.environ.get("DENDRO_BUILD_DIR", ROOT / "build")) / "devel/lib/dendro_slam"
 CLASSES = ["ground", "wood", "leaf", "other"]
 WOOD, OTHER = 1, 3
 PLANES = 9
@@ -714,7 +715,7 @@ def finished(folder, pattern):
 
 def simulate(args):
     """Simulates what is missing, a few folders at a time. Every folder has its own scene seeds."""
-    program = ROOT / "build/devel/lib/dendro_slam/simulate_training_scans"
+    program = PROGRAMS / "simulate_training_scans"
     jobs = [("held_out", args.test_scans, 900000)] if not finished(args.data, "held_out") else []
     if not finished(args.data, "train_*"):
         share = -(-args.train_scans // args.folders)

@@ -1,0 +1,46 @@
+"""The training script and the C++ network: the same logits, and a training that can be interrupted."""
+import argparse
+import json
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+pytest.importorskip("torch", reason="python3-torch is missing; scripts/setup installs it")
+import benchmark_segmentation  # noqa: E402
+import train_segmentation as training  # noqa: E402
+
+
+@pytest.mark.parametrize("rows, cols", [(16, 1800), (32, 360)])
+def test_shipped_weights_give_what_pytorch_gives(rows, cols):
+    result = benchmark_segmentation.agreement(
+        argparse.Namespace(weights=None, agreement=4, rows=rows, cols=cols))
+    assert result["largest_logit"] > 1.0  # The comparison is of something.
+    assert result["largest_logit_difference"] < 2e-3
+    assert result["same_label"] >= 0.9999
+
+
+def test_training_from_nothing_and_resumed(tmp_path):
+    def run(*more):
+        return subprocess.run(
+            [sys.executable, str(ROOT / "scripts/train_segmentation.py"), "--data", str(tmp_path / "data"),
+             "--output", str(tmp_path / "weights.safetensors"), "--threads", "1", "--no-bfloat16",
+             "--train-scans", "4", "--folders", "1", "--test-scans", "2", "--encoder-epochs", "1",
+             "--decoder-epochs", "1", "--steps", "2", "--batch", "2", "--width", "64",
+             "--score-every", "1", *more],
+            check=True, capture_output=True, text=True).stdout
+
+    first = run("--joint-epochs", "1")
+    assert "[3/3] phase=joint" in first
+    scores = json.loads(first[first.index("{"):])
+    assert set(scores) == {"all", "leafy"}  # The first two held-out scans are of one scene.
+    resumed = run("--joint-epochs", "2", "--resume")
+    assert "resumed after epoch 3 of 4" in resumed and "[4/4] phase=joint" in resumed
+    tensors, metadata = training.read_safetensors(tmp_path / "weights.safetensors")
+    assert metadata["layers"] == training.LAYERS and len(tensors) > 20
+    card = (tmp_path / "weights.md").read_text()
+    assert "4 scans to train" in card and "2 epochs joint" in card
