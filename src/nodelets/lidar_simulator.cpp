@@ -42,6 +42,7 @@ class LidarSimulator : public nodelet::Nodelet {
       odometry_ = nh.advertise<nav_msgs::Odometry>("odometry", 1000);
       truth_pose_ = nh.advertise<geometry_msgs::PoseStamped>("ground_truth/lidar_pose", 10);
       truth_labels_ = nh.advertise<sensor_msgs::PointCloud2>("ground_truth/labels", 10);
+      truth_hits_ = nh.advertise<sensor_msgs::PointCloud2>("ground_truth/hits", 10);
       truth_trees_ = nh.advertise<dendro_slam::TreeMap>("ground_truth/tree_map", 1, true);
       if (config_.publish_imu) imu_ = nh.advertise<sensor_msgs::Imu>("imu/data_raw", 1000);
       if (config_.publish_clock) clock_ = nh.advertise<rosgraph_msgs::Clock>("/clock", 10);
@@ -127,6 +128,7 @@ class LidarSimulator : public nodelet::Nodelet {
         if (truth_labels_.getNumSubscribers() > 0) {
           truth_labels_.publish(RigMessages::TruthLabels(scan));
         }
+        if (truth_hits_.getNumSubscribers() > 0) truth_hits_.publish(RigMessages::TruthHits(scan));
       }
       NODELET_INFO("the flight is over");
     } catch (const std::exception& error) {
@@ -170,6 +172,7 @@ class LidarSimulator : public nodelet::Nodelet {
   ros::Publisher odometry_;
   ros::Publisher truth_pose_;
   ros::Publisher truth_labels_;
+  ros::Publisher truth_hits_;
   ros::Publisher truth_trees_;
   ros::Publisher imu_;
   ros::Publisher clock_;

@@ -2,9 +2,12 @@
 
 #include <boost/make_shared.hpp>
 
+#include <algorithm>
 #include <cstring>
+#include <initializer_list>
 
 #include "dendro_slam/ros/conversions.h"
+#include "dendro_slam/sim/truth_writer.h"
 
 namespace dendro_ros {
 namespace {
@@ -19,6 +22,36 @@ geometry_msgs::TransformStamped Transform(std::int64_t stamp_ns,
   msg.child_frame_id = child;
   msg.transform = ToTransformMsg(T_parent_child);
   return msg;
+}
+
+struct Field {
+  const char* name;
+  std::uint8_t datatype;
+  std::uint32_t bytes;
+};
+
+/// A cloud of packed rows without coordinates, zeroed.
+sensor_msgs::PointCloud2Ptr PackedCloud(std::int64_t stamp_ns,
+                                        std::size_t rows,
+                                        std::initializer_list<Field> fields) {
+  auto cloud = boost::make_shared<sensor_msgs::PointCloud2>();
+  cloud->header.stamp = ToRosTime(stamp_ns);
+  cloud->header.frame_id = RigMessages::kLidarFrame;
+  cloud->height = 1;
+  cloud->width = static_cast<std::uint32_t>(rows);
+  for (const Field& field : fields) {
+    sensor_msgs::PointField out;
+    out.name = field.name;
+    out.offset = cloud->point_step;
+    out.datatype = field.datatype;
+    out.count = 1;
+    cloud->fields.push_back(out);
+    cloud->point_step += field.bytes;
+  }
+  cloud->row_step = cloud->width * cloud->point_step;
+  cloud->is_dense = true;
+  cloud->data.resize(cloud->row_step);
+  return cloud;
 }
 
 }  // namespace
@@ -109,26 +142,11 @@ geometry_msgs::PoseStamped RigMessages::TruthLidarPose(const dendro::SimulatedSc
 }
 
 sensor_msgs::PointCloud2Ptr RigMessages::TruthLabels(const dendro::SimulatedScan& scan) {
-  auto cloud = boost::make_shared<sensor_msgs::PointCloud2>();
-  cloud->header.stamp = ToRosTime(scan.scan.stamp_ns);
-  cloud->header.frame_id = kLidarFrame;
-  cloud->height = 1;
-  cloud->width = static_cast<std::uint32_t>(scan.truth.size());
-  const auto add = [&cloud](const char* name, std::uint32_t offset, std::uint8_t datatype) {
-    sensor_msgs::PointField field;
-    field.name = name;
-    field.offset = offset;
-    field.datatype = datatype;
-    field.count = 1;
-    cloud->fields.push_back(field);
-  };
-  add("label", 0, sensor_msgs::PointField::UINT8);
-  add("branch", 1, sensor_msgs::PointField::INT16);
-  add("tree", 3, sensor_msgs::PointField::INT16);
-  cloud->point_step = 5;
-  cloud->row_step = cloud->width * cloud->point_step;
-  cloud->is_dense = true;
-  cloud->data.resize(cloud->row_step);
+  auto cloud = PackedCloud(scan.scan.stamp_ns,
+                           scan.truth.size(),
+                           {{"label", sensor_msgs::PointField::UINT8, 1},
+                            {"branch", sensor_msgs::PointField::INT16, 2},
+                            {"tree", sensor_msgs::PointField::INT16, 2}});
   std::uint8_t* data = cloud->data.data();
   for (const dendro::PointTruth& truth : scan.truth) {
     data[0] = static_cast<std::uint8_t>(dendro::SurfaceLabel(truth.kind));
@@ -139,15 +157,33 @@ sensor_msgs::PointCloud2Ptr RigMessages::TruthLabels(const dendro::SimulatedScan
   return cloud;
 }
 
+sensor_msgs::PointCloud2Ptr RigMessages::TruthHits(const dendro::SimulatedScan& scan) {
+  const std::vector<dendro::BranchHits> hits = dendro::CountBranchHits(scan);
+  auto cloud = PackedCloud(scan.scan.stamp_ns,
+                           hits.size(),
+                           {{"tree", sensor_msgs::PointField::INT16, 2},
+                            {"branch", sensor_msgs::PointField::INT16, 2},
+                            {"hits", sensor_msgs::PointField::UINT32, 4}});
+  std::uint8_t* data = cloud->data.data();
+  for (const dendro::BranchHits& branch : hits) {
+    std::memcpy(data, &branch.tree_id, 2);
+    std::memcpy(data + 2, &branch.branch_id, 2);
+    std::memcpy(data + 4, &branch.hits, 4);
+    data += cloud->point_step;
+  }
+  return cloud;
+}
+
 dendro_slam::TreeMapPtr RigMessages::TruthTrees(const dendro::Scene& scene, std::int64_t stamp_ns) {
   dendro::TreeModel model;
   model.stamp_ns = stamp_ns;
-  int next_branch = 0;
+  int first_branch = 0;
   for (std::size_t t = 0; t < scene.trees.size(); ++t) {
-    const int first_branch = next_branch;
+    int largest_id = -1;
     for (const dendro::SceneBranch& branch : scene.trees[t].branches) {
       dendro::MapBranch out;
-      out.id = next_branch++;
+      out.id = first_branch + branch.id;
+      largest_id = std::max(largest_id, branch.id);
       out.tree_id = static_cast<int>(t);
       if (branch.parent >= 0) out.parent_id = first_branch + branch.parent;
       out.base = branch.points.front().position;
@@ -176,9 +212,16 @@ dendro_slam::TreeMapPtr RigMessages::TruthTrees(const dendro::Scene& scene, std:
     }
     dendro::MapTree tree;
     tree.id = static_cast<int>(t);
-    tree.trunk_branch_id = first_branch;
+    for (const dendro::SceneBranch& branch : scene.trees[t].branches) {
+      if (branch.parent >= 0) continue;
+      tree.trunk_branch_id = first_branch + branch.id;
+      break;
+    }
     model.trees.push_back(tree);
+    first_branch += largest_id + 1;
   }
+  std::sort(model.branches.begin(), model.branches.end(),
+            [](const dendro::MapBranch& a, const dendro::MapBranch& b) { return a.id < b.id; });
   return ToMsg(model, kMapFrame);
 }
 

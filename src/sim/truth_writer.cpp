@@ -28,6 +28,16 @@ std::string StampText(std::int64_t stamp_ns) {
 
 }  // namespace
 
+std::vector<BranchHits> CountBranchHits(const SimulatedScan& scan) {
+  std::map<std::pair<std::int16_t, std::int16_t>, std::uint32_t> hits;
+  for (const PointTruth& truth : scan.truth) {
+    if (truth.branch_id >= 0) ++hits[{truth.tree_id, truth.branch_id}];
+  }
+  std::vector<BranchHits> out;
+  for (const auto& [key, count] : hits) out.push_back({key.first, key.second, count});
+  return out;
+}
+
 TruthWriter::TruthWriter(const std::string& folder, const Scene& scene) : folder_(folder) {
   std::error_code error;
   std::filesystem::create_directories(folder, error);
@@ -55,17 +65,15 @@ void TruthWriter::AddScan(const SimulatedScan& scan) {
   if (q.w() < 0.0) q.coeffs() = -q.coeffs();
   trajectory_ << fmt::format("{} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n", stamp, t.x(), t.y(),
                              t.z(), q.x(), q.y(), q.z(), q.w());
-  std::map<std::pair<int, int>, int> hits;
   std::vector<std::uint8_t> label;
   std::vector<std::int16_t> branch, tree;
   for (const PointTruth& truth : scan.truth) {
     label.push_back(static_cast<std::uint8_t>(SurfaceLabel(truth.kind)));
     branch.push_back(truth.branch_id);
     tree.push_back(truth.tree_id);
-    if (truth.branch_id >= 0) ++hits[{truth.tree_id, truth.branch_id}];
   }
-  for (const auto& [key, count] : hits) {
-    hits_ << fmt::format("{},{},{},{}\n", stamp, key.first, key.second, count);
+  for (const BranchHits& row : CountBranchHits(scan)) {
+    hits_ << fmt::format("{},{},{},{}\n", stamp, row.tree_id, row.branch_id, row.hits);
   }
   Write(&labels_, scan.scan.stamp_ns);
   Write(&labels_, static_cast<std::uint32_t>(label.size()));

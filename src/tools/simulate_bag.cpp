@@ -163,6 +163,7 @@ void Run(const Options& options) {
                   *dendro_ros::ToVelodyneCloud(scan.scan, RigMessages::kLidarFrame));
         bag.Write(RigMessages::kTruthLidarTopic, end, RigMessages::TruthLidarPose(scan));
         bag.Write(RigMessages::kTruthLabelsTopic, end, *RigMessages::TruthLabels(scan));
+        bag.Write(RigMessages::kTruthHitsTopic, end, *RigMessages::TruthHits(scan));
         truth.AddScan(scan);
         points += scan.scan.points.size();
         progress.Show(static_cast<double>(index + 1) / num_scans);

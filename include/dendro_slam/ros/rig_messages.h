@@ -31,6 +31,7 @@ class RigMessages {
   static constexpr const char* kImuTopic = "/imu/data_raw";
   static constexpr const char* kTruthLidarTopic = "/ground_truth/lidar_pose";
   static constexpr const char* kTruthLabelsTopic = "/ground_truth/labels";
+  static constexpr const char* kTruthHitsTopic = "/ground_truth/hits";
   static constexpr const char* kTruthTreesTopic = "/ground_truth/tree_map";
   static constexpr const char* kLidarFrame = "velodyne";
   static constexpr const char* kBaseFrame = "base_link";
@@ -55,7 +56,10 @@ class RigMessages {
   /// True label (uint8), branch and tree (int16, -1 none) of every return, in the cloud's order; the
   /// cloud has no coordinates of its own.
   static sensor_msgs::PointCloud2Ptr TruthLabels(const dendro::SimulatedScan& scan);
-  /// The scene's trees as a map.
+  /// Returns on each branch that the scan met: tree, branch (int16), hits (uint32) in rows as above.
+  static sensor_msgs::PointCloud2Ptr TruthHits(const dendro::SimulatedScan& scan);
+  /// The scene's trees as a map. Its branch ids are those of the scene, in the second and further trees
+  /// after the largest id of the tree before, as ids must be unique in a map.
   static dendro_slam::TreeMapPtr TruthTrees(const dendro::Scene& scene, std::int64_t stamp_ns);
 
  private:

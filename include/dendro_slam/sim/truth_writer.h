@@ -40,6 +40,16 @@ class TruthWriter {
   std::ofstream labels_;
 };
 
+/// Returns that one scan has on one branch.
+struct BranchHits {
+  std::int16_t tree_id = -1;
+  std::int16_t branch_id = -1;
+  std::uint32_t hits = 0;
+};
+
+/// Returns per tree and branch (trunk included), ascending; only those with hits.
+std::vector<BranchHits> CountBranchHits(const SimulatedScan& scan);
+
 /// One scan of a `labels.bin` (or of predicted labels: the ids are empty then).
 struct ScanLabels {
   std::int64_t stamp_ns = 0;
