@@ -1,8 +1,11 @@
 #!/usr/bin/python3
-"""Draws a scene and one simulated VLP-16 scan of it, side by side, into a PNG.
+"""Draws a scene and one simulated VLP-16 scan of it, seen by the same camera, side by side, into a PNG.
 
 The picture is rendered by the simulator's own ray caster (program preview_scene), so it shows exactly
-what the lidar meets.
+what the lidar meets. Returns have the colour of what they truly fell on; every branch has its own.
+
+    scripts/draw_scene.py config/scenes/thesis_tree.yaml -o thesis_tree.png
+    scripts/draw_scene.py --all doc/scenes          # every shipped scene, from a good place
 """
 import argparse
 import os
@@ -15,65 +18,122 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-COLOURS = {"ground": "#c9b27c", "trunk": "#6b4423", "branch": "#d2691e", "leaf": "#2e8b57",
-           "obstacle": "#707783"}
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+SCENES = os.path.join(ROOT, "config", "scenes")
+# Where the lidar stands, where the picture is taken from, and its centre.
+VIEWS = {
+    "thesis_tree": ([4.0, -1.5, 2.4], [8.6, -6.0, 4.2], [0.0, 0.0, 3.1]),
+    "thesis_tree_pillars": ([4.0, -1.5, 2.4], [9.5, -7.5, 5.5], [0.0, 0.0, 2.8]),
+    "saguaro": ([3.0, -1.5, 1.8], [5.2, -4.6, 2.6], [0.0, 0.0, 1.9]),
+    "palo_verde": ([3.6, -2.0, 1.8], [6.6, -5.2, 3.2], [0.0, 0.0, 2.2]),
+    "orchard_row": ([-2.0, -3.0, 1.6], [-6.0, -11.0, 5.0], [0.0, 0.0, 1.6]),
+    "savanna": ([5.0, 2.0, 1.6], [-1.0, -7.5, 4.2], [9.0, 1.5, 1.4]),
+}
+BACKGROUND = "#10141a"
+KINDS = {"ground": "#8f7f5c", "leaf": "#4fb35a", "obstacle": "#8e99ab", "trunk": "#e08a3c"}
+BRANCHES = ["#f2c14e", "#5ec4e8", "#e86a92", "#b58cf0", "#f27d52", "#7ee0c0", "#d9e56b", "#f0a8d0"]
 
 
 def default_program():
-    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    return os.path.join(root, "build", "devel", "lib", "dendro_slam", "preview_scene")
+    return os.path.join(ROOT, "build", "devel", "lib", "dendro_slam", "preview_scene")
 
 
-def read_scan(path):
-    columns = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
-    return np.atleast_1d(columns)
+def project(points, eye, target):
+    """Image coordinates in half heights (x right, y down) and depth [m], as preview_scene's camera."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    d = points - eye
+    depth = d @ forward
+    scale = 1.0 / (np.tan(np.radians(25.0)) * np.maximum(depth, 1e-6))
+    return d @ right * scale, -(d @ up) * scale, depth
 
 
-def draw(scene, output, preview, radius, extra, title):
+def draw(scene, output, preview, view, extra):
+    lidar, eye, target = (np.asarray(v, float) for v in view)
     with tempfile.TemporaryDirectory() as folder:
-        command = [preview, scene, "-o", folder] + extra
-        result = subprocess.run(command, capture_output=True, text=True)
+        command = [preview, scene, "-o", folder, "--width", "720", "--height", "720"]
+        for option, place in (("--position", lidar), ("--eye", eye), ("--look-at", target)):
+            command += [option] + [repr(float(v)) for v in place]
+        result = subprocess.run(command + extra, capture_output=True, text=True)
         if result.returncode != 0:
             sys.exit(result.stderr.strip() or f"draw_scene: {preview} failed")
         picture = plt.imread(os.path.join(folder, "picture.ppm"))
-        scan = read_scan(os.path.join(folder, "scan.csv"))
-    figure = plt.figure(figsize=(13, 6.8))
-    axes = figure.add_subplot(1, 2, 1)
-    axes.imshow(picture)
-    axes.set_axis_off()
-    axes.set_title(title)
-    axes = figure.add_subplot(1, 2, 2, projection="3d")
-    near = np.hypot(scan["x"], scan["y"]) < radius
-    for kind, colour in COLOURS.items():
-        chosen = near & (scan["kind"] == kind)
-        size = 0.4 if kind == "ground" else 2.0
-        axes.scatter(scan["x"][chosen], scan["y"][chosen], scan["z"][chosen], s=size, c=colour,
-                     label=f"{kind} ({int(chosen.sum())})", depthshade=False)
-    axes.set_xlim(-radius, radius)
-    axes.set_ylim(-radius, radius)
-    top = max(3.0, float(scan["z"][near].max()) if near.any() else 3.0)
-    axes.set_zlim(0, top)
-    axes.set_box_aspect((2 * radius, 2 * radius, top), zoom=1.25)
-    axes.view_init(elev=12, azim=-35)
-    axes.set_title(f"one scan, {len(scan)} returns")
-    axes.legend(loc="upper left", markerscale=6, fontsize=8)
-    figure.tight_layout()
-    figure.savefig(output, dpi=90)
+        scan = np.atleast_1d(np.genfromtxt(os.path.join(folder, "scan.csv"), delimiter=",", names=True, dtype=None,
+                                           encoding="utf-8"))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 6.35), facecolor=BACKGROUND)
+    name = os.path.splitext(os.path.basename(scene))[0]
+    left.imshow(picture)
+    left.set_title(name, color="white", fontsize=13)
+    right.set_facecolor(BACKGROUND)
+    points = np.column_stack([scan[c] for c in "xyz"])
+    x, y, depth = project(points, eye, target)
+    visible = (depth > 0.5) & (np.abs(x) < 1.0) & (np.abs(y) < 1.0)
+    order = np.argsort(-depth)
+    colour = np.array([KINDS.get(k, "#ffffff") for k in scan["kind"]], dtype=object)
+    woody = scan["kind"] == "branch"
+    ids = np.unique(np.column_stack([scan["tree"][woody], scan["branch"][woody]]), axis=0)
+    for i, (tree, branch) in enumerate(ids):
+        colour[woody & (scan["tree"] == tree) & (scan["branch"] == branch)] = BRANCHES[i % len(BRANCHES)]
+    base = np.where(scan["kind"] == "ground", 2.0, 7.0)
+    size = np.clip(base * (np.linalg.norm(target - eye) / np.maximum(depth, 0.5)) ** 1.3, 0.4, 30.0)
+    order = order[visible[order]]
+    right.scatter(x[order], y[order], s=size[order], c=list(colour[order]), linewidths=0)
+    sx, sy, sd = project(lidar[None], eye, target)
+    if sd[0] > 0 and abs(sx[0]) < 1 and abs(sy[0]) < 1:
+        right.plot(sx, sy, marker="o", color="white", markersize=7, markeredgecolor="black")
+        right.annotate("lidar", (sx[0], sy[0]), (8, 4), textcoords="offset points", color="white", fontsize=10)
+    right.set_xlim(-1, 1)
+    right.set_ylim(1, -1)
+    right.set_aspect("equal")
+    right.set_title(f"one revolution of the VLP-16, {len(scan):,} returns", color="white", fontsize=13)
+    kinds = [k for k in ("trunk", "branch", "leaf", "obstacle", "ground") if np.any(scan["kind"] == k)]
+    handles = [plt.Line2D([], [], marker="o", linestyle="", color=KINDS.get(k, BRANCHES[0]),
+                          label=f"{k} {int(np.sum(scan['kind'] == k)):,}") for k in kinds]
+    right.legend(handles=handles, loc="upper left", frameon=False, labelcolor="white", fontsize=9, borderaxespad=0.2)
+    for axes in (left, right):
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+    figure.subplots_adjust(0.005, 0.005, 0.995, 0.945, wspace=0.01)
+    figure.savefig(output, dpi=95, facecolor=BACKGROUND)
     plt.close(figure)
+    # 256 colours are enough and make a quarter of the bytes.
+    from PIL import Image
+    Image.open(output).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(output, optimize=True)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter,
                                      epilog="Further arguments go to preview_scene, for example "
-                                            "--position 4.5 -3 1.5 --eye 9 -6 3 --look-at 0 0 3.")
-    parser.add_argument("scene", help="scene file (YAML)")
-    parser.add_argument("-o", "--output", required=True, help="PNG to write")
+                                            "--lidar-return_mode dual, or --path PATH --scan 100.")
+    parser.add_argument("scene", nargs="?", help="scene file (YAML)")
+    parser.add_argument("-o", "--output", help="PNG to write")
+    parser.add_argument("--all", metavar="FOLDER", help="draw every shipped scene into this folder")
     parser.add_argument("--preview", default=default_program(), help="program preview_scene")
-    parser.add_argument("--radius", type=float, default=6.0, help="half width of the scan's drawing [m]")
+    for name, meaning in (("--position", "where the lidar stands, upright [m]"),
+                          ("--eye", "where the picture is taken from [m]"), ("--look-at", "its centre [m]")):
+        parser.add_argument(name, nargs=3, type=float, metavar=("X", "Y", "Z"), help=meaning)
     arguments, extra = parser.parse_known_args()
-    title = os.path.splitext(os.path.basename(arguments.scene))[0]
-    draw(arguments.scene, arguments.output, arguments.preview, arguments.radius, extra, title)
+    if (arguments.scene is None) == (arguments.all is None):
+        parser.error("expected either SCENE and -o PNG, or --all FOLDER")
+    if arguments.scene and not arguments.output:
+        parser.error("expected -o PNG")
+    if not os.access(arguments.preview, os.X_OK):
+        sys.exit(f"draw_scene: {arguments.preview} is not built; scripts/build preview_scene")
+    if arguments.all:
+        os.makedirs(arguments.all, exist_ok=True)
+        for name, view in VIEWS.items():
+            draw(os.path.join(SCENES, name + ".yaml"), os.path.join(arguments.all, name + ".png"), arguments.preview,
+                 view, extra)
+        return
+    name = os.path.splitext(os.path.basename(arguments.scene))[0]
+    view = VIEWS.get(name, ([4.5, -3.0, 1.5], [8.5, -5.7, 3.0], [0.0, 0.0, 3.0]))
+    view = [given or default for given, default in zip((arguments.position, arguments.eye, arguments.look_at), view)]
+    draw(arguments.scene, arguments.output, arguments.preview, view, extra)
 
 
 if __name__ == "__main__":

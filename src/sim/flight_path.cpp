@@ -21,6 +21,7 @@ namespace {
 
 constexpr double kDegree = M_PI / 180.0;
 constexpr double kKnotPeriodS = 0.05;
+constexpr double kLongestS = 86400.0;  ///< Nobody flies for longer than a day.
 
 /// A place at a time.
 struct TimedPoint {
@@ -154,6 +155,7 @@ void AddSpiral(const YamlMap& map,
   } else if (map.Has("duration_s")) {
     laps = PositiveNumber(map, "duration_s") * speed / mean_lap;
   }
+  if (laps * mean_lap / speed > kLongestS) map.Fail("laps", "the flight would take more than a day; expected fewer");
   const double start = map.Number("start_deg", 0.0) * kDegree;
   const int steps = std::max(16, static_cast<int>(std::ceil(laps * 180.0)));
   for (int i = 0; i <= steps; ++i) {
@@ -182,6 +184,9 @@ std::vector<TimedPose> ReadTum(const YamlMap& map, const std::string& path) {
     double x, y, z, qx, qy, qz, qw;
     if (!(words >> stamp >> x >> y >> z >> qx >> qy >> qz >> qw)) {
       map.Fail("file", fmt::format("{}: line {}: expected stamp x y z qx qy qz qw", path, number));
+    }
+    if (!(std::max({std::abs(x), std::abs(y), std::abs(z)}) <= 1e9)) {
+      map.Fail("file", fmt::format("{}: line {}: a position is out of this world", path, number));
     }
     const Eigen::Quaterniond q(qw, qx, qy, qz);
     if (std::abs(q.norm() - 1.0) > 0.01) {
@@ -301,6 +306,9 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
       for (const std::vector<double>& row : rows) raw.Add({row[0], row[1], row[2]}, speed);
     }
     path_end_s = raw.end_s() + hover;
+    if (path_end_s > kLongestS) {
+      map.Fail("speed_mps", fmt::format("the path would take {:.0f} s; expected at most a day", path_end_s));
+    }
 
     Wobble wobble;
     if (map.Has("wobble")) {
@@ -392,6 +400,7 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
   path.name = std::filesystem::path(name).stem().string();
   path.duration_s = path_end_s;
   if (map.Has("duration_s")) path.duration_s = PositiveNumber(map, "duration_s");
+  if (path.duration_s > kLongestS) map.Fail("duration_s", "expected at most a day, 86400 [s]");
   const int start_s = map.Integer("start_stamp_s", 1600000000);
   if (start_s < 0) map.Fail("start_stamp_s", "expected a whole number of seconds >= 0");
   path.start_stamp_ns = static_cast<std::int64_t>(start_s) * 1000000000;

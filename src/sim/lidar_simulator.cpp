@@ -201,9 +201,11 @@ SimulatedScan LidarSimulator::SimulateScan(int scan_index, const LidarPoseFuncti
   const int nh = config_.enable_footprint ? config_.sub_rays_height : 1;
   const auto sub_rays = static_cast<std::size_t>(nw * nh);
   std::vector<Eigen::Vector2d> sub(sub_rays);
-  for (int i = 0; i < nw; ++i) {
-    for (int j = 0; j < nh; ++j) {
-      sub[static_cast<std::size_t>(i * nh + j)] = {(i + 0.5) / nw - 0.5, (j + 0.5) / nh - 0.5};
+  for (int j = 0; j < nh; ++j) {
+    for (int i = 0; i < nw; ++i) {
+      // To and fro across the beam, so that each sub-ray is next to the one before.
+      const int column = j % 2 == 0 ? i : nw - 1 - i;
+      sub[static_cast<std::size_t>(j * nw + i)] = {(column + 0.5) / nw - 0.5, (j + 0.5) / nh - 0.5};
     }
   }
   // With an odd grid the middle sub-ray is the central ray; else the central ray is one more.

@@ -198,6 +198,7 @@ struct Raycaster::Impl {
                 double max_m,
                 Best* best) const;
   double TestGround(const Eigen::Vector3d& o, const Eigen::Vector3d& d, double min_m, double max_m) const;
+  void TestGround(const RayBundle& bundle, double max_m, Best* best) const;
   RayHit Resolve(const Eigen::Vector3d& o, const Eigen::Vector3d& d, const Best& best) const;
 
   std::vector<Cone> cones;
@@ -466,6 +467,32 @@ double Raycaster::Impl::TestGround(const Eigen::Vector3d& o,
   return kNoHit;
 }
 
+void Raycaster::Impl::TestGround(const RayBundle& bundle, double max_m, Best* best) const {
+  const std::size_t n = bundle.directions.size();
+  double from_m = 0.0;
+  if (rough) {
+    // One walk along the central ray tells how far every sub-ray is above the rough ground.
+    rough->Intersect(bundle.origin, bundle.direction, 0.0, max_m, bundle.half_width_m,
+                     1.01 * bundle.half_angle_rad, &from_m);
+  }
+  double next_m = from_m;
+  for (std::size_t i = 0; i < n; ++i) {
+    const Eigen::Vector3d& o = bundle.origins[i];
+    const Eigen::Vector3d& d = bundle.directions[i];
+    if (rough && i + 1 < n) {
+      // And each sub-ray tells it for the next one, which is nearer still.
+      double safe_m = from_m;
+      const auto t = rough->Intersect(o, d, next_m, max_m, (bundle.origins[i + 1] - o).norm(),
+                                      (bundle.directions[i + 1] - d).norm(), &safe_m);
+      best[i].range_m = t ? *t : kNoHit;
+      next_m = safe_m;
+    } else {
+      best[i].range_m = TestGround(o, d, next_m, max_m);
+    }
+    best[i].is_ground = best[i].range_m < kNoHit;
+  }
+}
+
 RayHit Raycaster::Impl::Resolve(const Eigen::Vector3d& o,
                                 const Eigen::Vector3d& d,
                                 const Best& best) const {
@@ -585,18 +612,9 @@ void Raycaster::CastBundle(const RayBundle& bundle,
     throw std::invalid_argument("RayBundle: origins and directions must agree, at most 256 sub-rays");
   }
   double farthest = 0.0;
-  double ground_from = 0.0;
-  if (impl.rough) {
-    // One walk along the central ray tells how far every sub-ray is above the rough ground.
-    impl.rough->Intersect(bundle.origin, bundle.direction, 0.0, max_range_m, bundle.half_width_m,
-                          1.01 * bundle.half_angle_rad, &ground_from);
-  }
-  for (std::size_t i = 0; i < n; ++i) {
-    best[i] = Best();
-    best[i].range_m = impl.TestGround(bundle.origins[i], bundle.directions[i], ground_from, max_range_m);
-    best[i].is_ground = best[i].range_m < kNoHit;
-    farthest = std::max(farthest, std::min(best[i].range_m, max_range_m));
-  }
+  for (std::size_t i = 0; i < n; ++i) best[i] = Best();
+  impl.TestGround(bundle, max_range_m, best.data());
+  for (std::size_t i = 0; i < n; ++i) farthest = std::max(farthest, std::min(best[i].range_m, max_range_m));
   const auto half_width = static_cast<float>(bundle.half_width_m) + 1e-5F;
   const auto half_angle = static_cast<float>(bundle.half_angle_rad) * 1.01F;
   if (!impl.nodes.empty()) {

@@ -21,8 +21,9 @@ class RoughGround {
 
   /// Range of the first point of the ray at or below the surface, within [min, max].
   /// @param half_width_m, half_angle_rad  Every ray that starts within the half width of this one and
-  ///                      deviates by less than the half angle is still above the surface ...
-  /// @param safe_m        ... up to this range (when asked for).
+  ///                      whose unit direction differs by less than the half angle is still above the
+  ///                      surface ...
+  /// @param safe_m        ... up to this range; left as it is where this ray cannot tell.
   std::optional<double> Intersect(const Eigen::Vector3d& origin,
                                   const Eigen::Vector3d& direction,
                                   double min_range_m,
@@ -33,12 +34,15 @@ class RoughGround {
 
  private:
   static constexpr int kWaves = 5;
-  static constexpr int kLanes = 6;  ///< Waves with one of no amplitude: an even number for the loops.
+  static constexpr int kLanes = 8;  ///< Waves, filled up with ones of no amplitude for vector loops.
 
-  /// Height of the surface and its derivative along a horizontal direction (need not be unit).
-  void Evaluate(double x, double y, double dx, double dy, double* height, double* slope) const;
+  struct Surface {
+    double height_m, slope_x, slope_y;
+  };
+  Surface Evaluate(double x, double y) const;
 
-  alignas(16) std::array<double, kLanes> kx_{}, ky_{}, phase_{}, wave_amplitude_{};
+  alignas(16) std::array<double, kLanes> kx_{}, ky_{}, phase_{};
+  alignas(16) std::array<float, kLanes> amplitude_f_{}, slope_x_f_{}, slope_y_f_{};
   double z_m_;
   double amplitude_m_;
   double slope_bound_ = 0.0;      ///< Of the height along any horizontal direction.

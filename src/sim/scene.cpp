@@ -21,6 +21,7 @@ namespace dendro {
 namespace {
 
 constexpr double kDegree = M_PI / 180.0;
+constexpr int kMostLeaves = 20000000;  ///< Of one tree; a large oak has a fiftieth of that.
 
 SurfaceKind ReadKind(const YamlMap& map,
                      const std::string& key,
@@ -41,7 +42,10 @@ SceneBranch ReadBranch(const YamlMap& map) {
   branch.id = map.Integer("id");
   if (branch.id < 0 || branch.id > 32767) map.Fail("id", "expected a whole number from 0 to 32767");
   if (!map.Has("parent")) map.Fail("parent", "the key is missing; expected null for the trunk or the id of a branch");
-  if (!map.IsNull("parent")) branch.parent = map.Integer("parent");
+  if (!map.IsNull("parent")) {
+    branch.parent = map.Integer("parent");
+    if (branch.parent < 0) map.Fail("parent", "expected null for the trunk or the id of a branch");
+  }
   branch.dead = map.Boolean("dead", false);
   const auto rows = map.Rows("points", 4);
   if (rows.size() < 2) map.Fail("points", "expected at least two points [x, y, z, radius]");
@@ -54,6 +58,16 @@ SceneBranch ReadBranch(const YamlMap& map) {
   }
   if (branch.Length() <= 0.0) map.Fail("points", "the branch has no length; expected points at different places");
   return branch;
+}
+
+/// Every parent must exist.
+bool LeadsToTrunk(const SceneTree& tree, const SceneBranch& branch) {
+  const SceneBranch* at = &branch;
+  for (std::size_t steps = 0; steps <= tree.branches.size(); ++steps) {
+    if (at->parent < 0) return true;
+    at = tree.FindBranch(at->parent);
+  }
+  return false;
 }
 
 SceneTree ReadTree(const YamlMap& map) {
@@ -77,11 +91,18 @@ SceneTree ReadTree(const YamlMap& map) {
                                              branch.parent, tree.name));
     }
   }
+  for (std::size_t i = 0; i < branches.size(); ++i) {
+    if (!LeadsToTrunk(tree, tree.branches[i])) {
+      branches[i].Fail("parent", "the parents go in a circle; expected them to lead to a trunk (parent: null)");
+    }
+  }
   if (map.Has("leaves")) {
     const YamlMap leaves = map.Map("leaves");
     leaves.AllowOnly({"count", "size_m", "seed", "max_wood_radius_m", "spread_m"});
     tree.leaves.count = leaves.Integer("count");
-    if (tree.leaves.count < 0) leaves.Fail("count", "expected a number >= 0");
+    if (tree.leaves.count < 0 || tree.leaves.count > kMostLeaves) {
+      leaves.Fail("count", fmt::format("expected a number from 0 to {}", kMostLeaves));
+    }
     tree.leaves.size_m = leaves.Number("size_m", tree.leaves.size_m);
     if (tree.leaves.size_m <= 0.0) leaves.Fail("size_m", "expected a size > 0 [m]");
     tree.leaves.seed = leaves.Seed("seed", tree.leaves.seed);
@@ -355,6 +376,7 @@ void ValidateScene(const Scene& scene) {
         if (!std::isfinite(p.radius_m) || p.radius_m < 0.0) fail("points: radii must be >= 0");
       }
       if (branch.Length() <= 0.0) fail("points: the branch has no length");
+      if (!LeadsToTrunk(tree, branch)) fail("parents go in a circle");
     }
     if (tree.leaves.count < 0) throw std::invalid_argument("tree " + tree.name + ": leaves.count must be >= 0");
     if (!(tree.leaves.size_m > 0.0)) throw std::invalid_argument("tree " + tree.name + ": leaves.size_m must be > 0");

@@ -86,8 +86,10 @@ YAML::Node YamlMap::Get(const std::string& key) const {
 double YamlMap::ToNumber(const YAML::Node& node,
                          const std::string& key,
                          const char* expected) const {
+  // Beyond a thousand million no length, time or angle makes sense, and single precision suffers.
+  constexpr double kLargest = 1e9;
   double value = 0.0;
-  if (!node.IsScalar() || !YAML::convert<double>::decode(node, value) || !std::isfinite(value)) {
+  if (!node.IsScalar() || !YAML::convert<double>::decode(node, value) || !(std::abs(value) <= kLargest)) {
     FailAt(node, key, fmt::format("expected {}", expected));
   }
   return value;

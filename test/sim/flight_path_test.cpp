@@ -139,6 +139,9 @@ TEST(FlightPath, EveryMistakeGetsTheFileTheLineTheKeyAndWhatIsExpected) {
   EXPECT_THAT(error("side_m: 8\n", ""), HasSubstr("corners or side_m"));
   EXPECT_THAT(error("yaw: 30", "yaw: 30\nodometry: {model: gps}"), AllOf(HasSubstr("odometry"), HasSubstr("t265, mavros or none")));
   EXPECT_THAT(error("yaw: 30", "yaw: 30\nodometry: {sed: 1}"), AllOf(HasSubstr("p.yaml:6"), HasSubstr("sed"), HasSubstr("unknown key")));
+  EXPECT_THAT(error("1.6", "1e-6"), AllOf(HasSubstr("p.yaml:4"), HasSubstr("speed_mps"), HasSubstr("at most a day")));
+  EXPECT_THAT(error("yaw: 30", "yaw: 30\nduration_s: 1e6"), AllOf(HasSubstr("p.yaml:6"), HasSubstr("duration_s"), HasSubstr("day")));
+  EXPECT_THAT(error("yaw: 30", "yaw: 30\norigin: {latitude_deg: 95, longitude_deg: 0}"), AllOf(HasSubstr("p.yaml:6"), HasSubstr("latitude_deg")));
   EXPECT_THAT(error("yaw: 30", "yaw: 30\nduration_s: 0"), AllOf(HasSubstr("duration_s"), HasSubstr("> 0")));
 }
 

@@ -3,12 +3,15 @@
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <random>
+#include <vector>
 
 #include <unistd.h>
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "dendro_slam/sim/flight_path.h"
 #include "dendro_slam/sim/raycaster.h"
 #include "dendro_slam/sim/scene_generator.h"
 #include "dendro_slam/sim/truth_writer.h"
@@ -78,6 +81,10 @@ TEST(Scene, EveryMistakeGetsTheFileTheLineTheKeyAndWhatIsExpected) {
               AllOf(HasSubstr("s.yaml:6"), HasSubstr("parent"), HasSubstr("branch 7 does not exist")));
   EXPECT_THAT(ErrorOf(Replaced("parent: 0", "parent: 4")), HasSubstr("does not exist"));
   EXPECT_THAT(ErrorOf(Replaced(", parent: 0", "")), AllOf(HasSubstr("s.yaml:6"), HasSubstr("parent"), HasSubstr("missing")));
+  EXPECT_THAT(ErrorOf(Replaced("parent: 0", "parent: -1")), AllOf(HasSubstr("s.yaml:6"), HasSubstr("parent"), HasSubstr("null")));
+  EXPECT_THAT(ErrorOf(Replaced("parent: null", "parent: 4")), AllOf(HasSubstr("s.yaml:5"), HasSubstr("circle")));
+  EXPECT_THAT(ErrorOf(Replaced("[0, 0, 0, 0.3]", "[0, 0, 1e30, 0.3]")), AllOf(HasSubstr("s.yaml:5"), HasSubstr("points[0]"), HasSubstr("finite")));
+  EXPECT_THAT(ErrorOf(Replaced("count: 20", "count: 2000000000")), AllOf(HasSubstr("s.yaml:7"), HasSubstr("leaves.count")));
   EXPECT_THAT(ErrorOf(Replaced("id: 4", "id: 0")), HasSubstr("twice"));
   EXPECT_THAT(ErrorOf(Replaced("id: 4", "id: four")), AllOf(HasSubstr("id"), HasSubstr("whole number")));
   EXPECT_THAT(ErrorOf(Replaced("id: 4", "id: 4.5")), HasSubstr("whole number"));
@@ -90,6 +97,55 @@ TEST(Scene, EveryMistakeGetsTheFileTheLineTheKeyAndWhatIsExpected) {
   EXPECT_THAT(ErrorOf("trees: [\n"), AllOf(HasSubstr("s.yaml:"), HasSubstr("not valid YAML")));
   EXPECT_THAT(ErrorOf(""), HasSubstr("empty"));
   EXPECT_THROW(LoadScene("/does/not/exist.yaml"), SceneFileError);
+}
+
+/// Text with a few random changes: characters, words and lines deleted, doubled, swapped, replaced.
+std::string Mutated(const std::string& text, std::mt19937* rng) {
+  static const std::vector<std::string> kWords = {
+      "-1", "0", "1e9", "1e308", ".nan", ".inf", "-.inf", "null", "~", "[]", "{}", "[", "}", ": ", "\n", "  ", "- ",
+      "&a", "*a", "!!binary", "true", "\"", "'", "|", ">", "?", "%", "\t", "\xff", "2147483648", "99999999999999999999",
+      "{a: 1}", "[[1, 2, 3, 4]]", "mesh.ply", "/dev/null", ".", "trunk", "box", "walk", "plane", "type"};
+  std::string out = text;
+  const int changes = 1 + static_cast<int>((*rng)() % 4);
+  for (int i = 0; i < changes; ++i) {
+    const std::size_t at = (*rng)() % (out.size() + 1);
+    const std::size_t length = std::min<std::size_t>((*rng)() % 12, out.size() - at);
+    switch ((*rng)() % 4) {
+      case 0: out.erase(at, length); break;
+      case 1: out.insert(at, out.substr(at, length)); break;
+      case 2: out.replace(at, length, kWords[(*rng)() % kWords.size()]); break;
+      default: out.insert(at, kWords[(*rng)() % kWords.size()]); break;
+    }
+  }
+  return out;
+}
+
+// Whatever is done to a file, it is read or refused with an error that begins with its name.
+TEST(Scene, DamagedFilesAreReadOrRefusedByName) {
+  std::mt19937 rng(7);
+  const std::string path = "type: circle\nradius_m: 4\naltitude_m: 2\nlaps: 0.2\nspeed_mps: 1\nlook_at: [0, 0, 1]\n"
+                           "odometry: {model: t265, seed: 2}\norigin: {latitude_deg: 1, longitude_deg: 2}\n"
+                           "extrinsics: {base_to_lidar: {position: [0, 0, 0.1], rpy_deg: [0, 0, 0]}}\n";
+  int read = 0, refused = 0;
+  for (int i = 0; i < 3000; ++i) {
+    const bool scene = i % 2 == 0;
+    const std::string text = Mutated(scene ? std::string(kGood) : path, &rng);
+    try {
+      if (scene) {
+        ValidateScene(ParseScene(text, "s.yaml"));
+      } else {
+        EXPECT_LE(ParseFlightPath(text, "s.yaml").duration_s, 86400.0);
+      }
+      ++read;
+    } catch (const SceneFileError& e) {
+      ++refused;
+      EXPECT_EQ(std::string(e.what()).rfind("s.yaml:", 0), 0u) << e.what() << "\n" << text;
+    } catch (const std::exception& e) {
+      ADD_FAILURE() << e.what() << "\n" << text;
+    }
+  }
+  EXPECT_GT(read, 200);
+  EXPECT_GT(refused, 1000);
 }
 
 TEST(Scene, MeshesAndCloudsAreReadAndTheirErrorsNameTheFile) {

@@ -159,5 +159,25 @@ def test_the_position_packets_tell_time_and_place(flight):
     assert data == [p for port, p in datagrams(folder / "flight.pcap") if port == 2368]
 
 
+def test_the_bytes_do_not_depend_on_the_threads(tmp_path):
+    def everything(threads):
+        folder = tmp_path / str(threads)
+        folder.mkdir()
+        result = subprocess.run(
+            [SIMULATE, ROOT / "config/scenes/thesis_tree.yaml", PATH, "-o", folder / "f.bag", "--duration", "0.6",
+             "--packets", "--imu", "--pcap", folder / "f.pcap", "--seed", "5", "--threads", str(threads)],
+            capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+        return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+    one = everything(1)
+    assert set(one) == {"f.bag", "f.pcap", "f.truth/scene.yaml", "f.truth/trajectory.tum", "f.truth/hits.csv",
+                        "f.truth/labels.bin"}
+    assert min(map(len, one.values())) > 100
+    for threads in (2, 4):
+        for name, content in everything(threads).items():
+            assert content == one[name], (name, threads)
+
+
 if __name__ == "__main__":
     sys.exit(pytest.main([__file__, "-q", "-p", "no:cacheprovider"]))
