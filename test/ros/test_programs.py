@@ -46,7 +46,7 @@ def bag(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("name", ["simulate_bag", "map_bag", "pcap_to_bag"])
+@pytest.mark.parametrize("name", ["simulate_bag", "map_bag", "pcap_to_bag", "label_bag"])
 def test_help(name):
     assert "Usage" in good(name, "--help").stdout
 
@@ -91,6 +91,17 @@ def test_capture_to_bag_to_map(bag, tmp_path):
     result = good("pcap_to_bag", bag.with_suffix(".pcap"), "-o", tmp_path / "capture.bag")
     assert " 0 lost" in result.stdout
     good("map_bag", tmp_path / "capture.bag", "-o", tmp_path / "map")
+
+
+def test_label_bag_draws_what_stage_1_sees(bag, tmp_path):
+    result = good("label_bag", bag, "-o", tmp_path / "labels", "--every", 10)
+    pictures = sorted((tmp_path / "labels").iterdir())
+    assert [p.name for p in pictures] == ["scan_00000.png", "scan_00010.png", "scan_00020.png"]
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in pictures)
+    for line in result.stdout.strip().splitlines():
+        ground, wood, leaf, other = (int(part.split()[0]) for part in line.split(": ")[1].split(", "))
+        assert ground > 5000 and 50 < wood < 3000 and leaf + other < 100, line  # A bare tree on a plane.
+    one_line_error(run("label_bag", bag, "-o", tmp_path / "x", "--weights", bag), "flight.bag")
 
 
 def test_real_capture(tmp_path):
