@@ -46,7 +46,8 @@ dendro_ros::NodesConfig ReadConfigs(const std::vector<std::string>& paths) {
   std::string where;
   for (const std::string& path : paths) {
     std::vector<std::string> files;
-    if (std::filesystem::is_directory(path)) {
+    const bool folder = std::filesystem::is_directory(path);
+    if (folder) {
       for (const auto& entry : std::filesystem::directory_iterator(path)) {
         if (entry.path().extension() == ".yaml") files.push_back(entry.path().string());
       }
@@ -58,6 +59,8 @@ dendro_ros::NodesConfig ReadConfigs(const std::vector<std::string>& paths) {
       where += (where.empty() ? "" : ", ") + file;
       const dendro_ros::ParamTree tree = dendro_ros::ReadYamlFile(file);
       for (const auto& section : tree.AsMap(file)) {
+        // The package's config folder also holds what driver_bridge reads.
+        if (folder && section.first == "rig") continue;
         if (!sections.insert(section).second) {
           throw dendro_ros::ParamError(
               fmt::format("{}: section '{}' was given before", file, section.first));
