@@ -15,6 +15,7 @@
 #include <map>
 #include <mutex>
 #include <optional>
+#include <sstream>
 #include <utility>
 
 #include <boost/make_shared.hpp>
@@ -502,9 +503,11 @@ class SensorSource::Impl {
                                     in->getMessageDefinition());
       main_ = std::make_unique<HoldingPublisher>(nh_, options, holding_);
     }
-    Send(fault.delay_ns, [this, out] {
+    // Without a stamp nobody can say that he is done with it.
+    const std::int64_t until_ns = BeginsWithHeader(*out) ? StampNs(Bytes(*out)) : 0;
+    Send(fault.delay_ns, [this, out, until_ns] {
       rate_.Add();
-      main_->Publish<topic_tools::ShapeShifter>(out, 0);
+      main_->Publish<topic_tools::ShapeShifter>(out, until_ns);
     });
   }
 
@@ -530,31 +533,40 @@ class SensorSource::Impl {
     return FromBytes(like, bytes);
   }
 
-  /// A message of any type that begins with a header, its stamp moved.
-  static topic_tools::ShapeShifter::Ptr WithStampMoved(const topic_tools::ShapeShifter& in,
-                                                       std::int64_t shift_ns) {
+  static bool BeginsWithHeader(const topic_tools::ShapeShifter& msg) {
     // The first field of the definition, past its comments.
-    std::istringstream definition(in.getMessageDefinition());
+    std::istringstream definition(msg.getMessageDefinition());
     std::string type;
     for (std::string line; std::getline(definition, line);) {
       std::istringstream words(line.substr(0, line.find('#')));
       if (words >> type) break;
     }
-    if (type != "Header" && type != "std_msgs/Header") {
+    return (type == "Header" || type == "std_msgs/Header") && msg.size() >= kHeaderBytes;
+  }
+
+  static std::vector<std::uint8_t> Bytes(const topic_tools::ShapeShifter& msg) {
+    std::vector<std::uint8_t> bytes(msg.size());
+    ros::serialization::OStream stream(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
+    msg.write(stream);
+    return bytes;
+  }
+
+  /// Of a message that begins with a header: sequence number, seconds, nanoseconds.
+  static std::int64_t StampNs(const std::vector<std::uint8_t>& bytes) {
+    std::uint32_t stamp[2];
+    std::memcpy(stamp, bytes.data() + kStampAt, sizeof(stamp));
+    return ToNs(ros::Time(stamp[0], stamp[1]));
+  }
+
+  /// A message of any type that begins with a header, its stamp moved.
+  static topic_tools::ShapeShifter::Ptr WithStampMoved(const topic_tools::ShapeShifter& in,
+                                                       std::int64_t shift_ns) {
+    if (!BeginsWithHeader(in)) {
       throw std::invalid_argument(in.getDataType() + " has no header whose stamp could be moved");
     }
-    std::vector<std::uint8_t> bytes(in.size());
-    ros::serialization::OStream stream(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
-    in.write(stream);
-    constexpr std::size_t kStampAt = 4;  // Behind the sequence number.
-    std::uint32_t stamp[2];              // Seconds, nanoseconds.
-    if (bytes.size() < kStampAt + sizeof(stamp)) {
-      throw std::invalid_argument(in.getDataType() + " is too short for a header");
-    }
-    std::memcpy(stamp, bytes.data() + kStampAt, sizeof(stamp));
-    const ros::Time moved = ToRosTime(ToNs(ros::Time(stamp[0], stamp[1])) + shift_ns);
-    stamp[0] = moved.sec;
-    stamp[1] = moved.nsec;
+    std::vector<std::uint8_t> bytes = Bytes(in);
+    const ros::Time moved = ToRosTime(StampNs(bytes) + shift_ns);
+    const std::uint32_t stamp[2] = {moved.sec, moved.nsec};
     std::memcpy(bytes.data() + kStampAt, stamp, sizeof(stamp));
     return FromBytes(in, bytes);
   }
@@ -649,6 +661,8 @@ class SensorSource::Impl {
     if (status.message.empty()) status.message = "running";
   }
 
+  static constexpr std::size_t kStampAt = 4;  ///< Of a header in a message, behind the sequence.
+  static constexpr std::size_t kHeaderBytes = 16;
   static constexpr double kRealsenseVariance = 0.01;  ///< realsense2_camera at confidence 3.
 
   ros::NodeHandle nh_;
