@@ -1,6 +1,7 @@
 """Runs a script: starts its sources and the recorder, watches them, and says how they are."""
 import json
 import os
+import shutil
 import signal
 import socket
 import tempfile
@@ -394,6 +395,8 @@ class Bridge:
             if self.recorder:
                 self.recorder.stop()
                 self.line.say("stopped" + self.recorded_text())
+        if not any(c.restarts for c in self.everyone().values()):
+            shutil.rmtree(self.run_folder, ignore_errors=True)  # else the logs say why
         try:
             rospy.delete_param(self.state_param)
         except (KeyError, rospy.ROSException, OSError):
