@@ -5,7 +5,8 @@
 
 Writes MAP_DIR/report.html and MAP_DIR/report.pdf (or NAME.html and NAME.pdf). With --truth (the folder
 that simulate_bag writes) radii and trajectory are drawn against it; with --tape a table of differences
-to tape measurements is added (columns: branch or height, radius_cm or circumference_cm).
+to tape measurements is added (columns: branch or height, radius_cm or circumference_cm). Maps of the thesis' two plants, simulated, also get its tables
+5.1 and 5.2 with a column of ours.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from dendro_eval.figures import all_figures  # noqa: E402
 from dendro_eval.files import MapDirectory, Truth  # noqa: E402
 from dendro_eval.scores import evaluate  # noqa: E402
 from dendro_eval.tape import compare_tape  # noqa: E402
+from dendro_eval.thesis import mean_errors, outside, thesis_table  # noqa: E402
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
@@ -82,7 +84,7 @@ def branch_table(map_dir):
                      number(r["middle_diameter_m"], 1, 100), number(r["tip_diameter_m"], 1, 100),
                      number(r["length_m"], 2), number(r["angle_deg"], 0), number(r["azimuth_deg"], 0),
                      number(r["height_m"], 2), f'{r["num_measured"]} of {r["num_cylinders"]}'])
-    return table(["branch", "tree", "leaves", "order", "&oslash; base [cm]", "&oslash; middle [cm]",
+    return table(["branch", "tree", "parent", "order", "&oslash; base [cm]", "&oslash; middle [cm]",
                   "&oslash; tip [cm]", "length [m]", "angle [&deg;]", "azimuth [&deg;]", "height [m]",
                   "cylinders measured"], rows)
 
@@ -118,6 +120,37 @@ def tape_table(rows):
                  text_columns=(0, 4)) + mean
 
 
+def thesis_rows(entry):
+    """Table 5.1 or 5.2 with our column, and below it how far off the tape each is."""
+    body = []
+    for r in entry["rows"]:
+        tape = f'{r["low_cm"]:g}' if r["low_cm"] == r["high_cm"] else f'{r["low_cm"]:g} &ndash; {r["high_cm"]:g}'
+        cells = [html.escape(r["name"]), tape, number(r["thesis_cm"], 2), with_sigma(r["ours_cm"], r["sigma_cm"] or 0,
+                                                                                   2, 1.0)]
+        for key in ("thesis_cm", "ours_cm"):
+            cells.append(number(None if r[key] is None else outside(r[key], r["low_cm"], r["high_cm"]), 2))
+        body.append(cells + [", ".join(map(str, r["branches"])) or "not found"])
+    text = table(["segment", "tape [cm]", "thesis [cm]", "ours [cm]", "thesis, off the tape [cm]",
+                  "ours, off the tape [cm]", "branches of the map"], body)
+    for key, name in (("thesis_cm", "Thesis"), ("ours_cm", "Ours")):
+        bound, middle = mean_errors(entry["rows"], key)
+        if bound is not None:
+            text += (f"<p>{name}: mean distance to the nearest tape bound {bound:.2f} cm, to the middle of the bounds "
+                     f"{middle:.2f} cm.</p>")
+    return text
+
+
+def crown_table(map_dir):
+    """Crowns by their leaf points; empty where none was measured."""
+    rows = [[r["tree_id"], number(r["crown_volume_m3"], 1), number(r["crown_projected_area_m2"], 1),
+             number(r["crown_base_height_m"], 2), number(r["crown_top_height_m"], 2), number(r["crown_alpha_m"], 2),
+             r["crown_points"]] for r in map_dir.trees if r.get("crown_volume_m3")]
+    if not rows:
+        return ""
+    return table(["tree", "crown volume [m&sup3;]", "projected area [m&sup2;]", "base [m]", "top [m]",
+                  "alpha [m]", "leaf points"], rows)
+
+
 def plain(text):
     """A table cell of the page as plain text."""
     text = re.sub(r"<[^>]*>", "", str(text))
@@ -129,13 +162,18 @@ def table_pages(title, page, rows_per_page=34):
     header = [plain(c) for c in re.findall(r"<th[^>]*>(.*?)</th>", page)]
     rows = [[plain(c) for c in re.findall(r"<td[^>]*>(.*?)</td>", row)]
             for row in re.findall(r"<tr>(<td.*?)</tr>", page)]
+    notes = [plain(p) for p in re.findall(r"<p>(.*?)</p>", page)]
     for first in range(0, max(len(rows), 1), rows_per_page):
         part = rows[first:first + rows_per_page]
         row_height = 0.2  # inches
-        height = 0.75 + row_height * (len(part) + 1)
+        last = first + rows_per_page >= len(rows)
+        below = 0.2 + (row_height * len(notes) if last else 0.0)
+        height = 0.55 + below + row_height * (len(part) + 1)
         figure = plt.figure(figsize=(11.7, height))
         figure.text(0.02, 1.0 - 0.3 / height, title + (" (continued)" if first else ""), fontsize=12)
-        ax = figure.add_axes([0.02, 0.2 / height, 0.96, row_height * (len(part) + 1) / height])
+        for k, note in enumerate(notes if last else []):
+            figure.text(0.02, (below - row_height * (k + 0.8)) / height, note, fontsize=8.5)
+        ax = figure.add_axes([0.02, below / height, 0.96, row_height * (len(part) + 1) / height])
         ax.axis("off")
         if not part:
             continue
@@ -166,6 +204,7 @@ def main():
         truth = Truth(arguments.truth) if arguments.truth else None
         scores = evaluate(map_dir, truth) if truth else None
         tape = compare_tape(arguments.tape, map_dir) if arguments.tape else None
+        thesis = thesis_table(map_dir, truth) if truth else None
         name = arguments.output or os.path.join(arguments.map_dir, "report")
         title = "Map of " + os.path.basename(os.path.normpath(arguments.map_dir))
         parts = [f"<h1>{html.escape(title)}</h1>"]
@@ -178,15 +217,24 @@ def main():
             parts.append("<h2>Trees</h2>" + tree_table(map_dir))
         if scores:
             parts.append("<h2>Against the truth</h2>" + score_table(scores))
+        if thesis:
+            parts.append(f"<h2>{html.escape(thesis['title'])}</h2>" + thesis_rows(thesis))
         if tape:
             parts.append("<h2>Against the tape</h2>" + tape_table(tape))
+        crowns = crown_table(map_dir) if map_dir.trees else ""
+        if crowns:
+            parts.append("<h2>Crowns</h2>" + crowns)
         tables = []  # of the PDF: before the figures
         if map_dir.trees:
             tables.append(("Trees", tree_table(map_dir)))
         if scores:
             tables.append(("Against the truth", score_table(scores)))
+        if thesis:
+            tables.append((thesis["title"], thesis_rows(thesis)))
         if tape:
             tables.append(("Against the tape", tape_table(tape)))
+        if crowns:
+            tables.append(("Crowns", crowns))
         os.makedirs(os.path.dirname(os.path.abspath(name)), exist_ok=True)
         with PdfPages(name + ".pdf.tmp", metadata={"Title": title, "CreationDate": None}) as pdf:
             def add_tables(which):

@@ -12,6 +12,7 @@ from matplotlib.collections import PolyCollection  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 from matplotlib.patches import Patch  # noqa: E402
 
+from .geometry import perpendicular_basis  # noqa: E402
 from .scores import alignment, common_stamps  # noqa: E402
 
 # Okabe and Ito 2008, in the order of tree.ply and of rviz.
@@ -282,10 +283,80 @@ def trajectory_figure(map_dir, truth=None):
     return fig
 
 
+SIDE_BINS = 36
+STEEP_DEG = 45.0
+
+
+def sides_seen(pieces, steep):
+    """Share of a branch's length that was seen from each of 36 directions around it.
+
+    Steep branches: compass directions, from +x counter-clockwise. Lying ones: from the upper side,
+    counter-clockwise looking from base to tip (the axis taken upwards where it is not level).
+    """
+    total = np.zeros(SIDE_BINS)
+    for length, axis, seen in pieces:
+        basis = perpendicular_basis(axis)
+        up = axis if axis[2] >= 0 else -axis
+        if steep:
+            zero, quarter = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+        else:
+            zero = np.array([0.0, 0.0, 1.0]) - up[2] * up
+            zero /= np.linalg.norm(zero)
+            quarter = np.cross(up, zero)
+        for k in range(SIDE_BINS):
+            turn = 2.0 * np.pi * (k + 0.5) / SIDE_BINS
+            direction = (np.cos(turn) * zero + np.sin(turn) * quarter) @ basis
+            angle = np.arctan2(direction[1], direction[0]) / (2.0 * np.pi) % 1.0
+            if seen[int(angle * len(seen)) % len(seen)]:
+                total[k] += length
+    return total / max(sum(p[0] for p in pieces), 1e-9)
+
+
 def coverage_figure(map_dir):
-    """How much of the way round every branch was seen (over its measured length)."""
+    """Which side of every branch was seen, as a share of its measured length."""
+    directions = map_dir.directions_seen()
     branches = [b for b in map_dir.branches if b.measured.any()]
     branches.sort(key=lambda b: (b.order, b.key))
+    if not directions:
+        return arc_figure(branches)
+    groups = {True: [], False: []}
+    for branch in branches:
+        pieces = directions.get(branch.key)
+        if not pieces:
+            continue
+        rise = abs(sum(length * (axis[2] if axis[2] >= 0 else -axis[2]) for length, axis, _ in pieces))
+        steep = rise / sum(p[0] for p in pieces) > np.cos(np.radians(STEEP_DEG))
+        groups[steep].append((branch, sides_seen(pieces, steep)))
+    shown = {steep: rows[:40] for steep, rows in groups.items() if rows}
+    heights = [max(len(rows), 2) for rows in shown.values()]
+    fig, axes = plt.subplots(len(shown), 1, figsize=(8.2, 1.1 * len(shown) + 0.9 + 0.24 * sum(heights)),
+                             gridspec_kw={"height_ratios": heights}, squeeze=False)
+    picture = None
+    for ax, (steep, rows) in zip(axes[:, 0], shown.items()):
+        picture = ax.imshow(np.array([r[1] for r in rows]), aspect="auto", cmap="cividis", vmin=0, vmax=1,
+                            extent=(0, 360, len(rows) - 0.5, -0.5), interpolation="nearest")
+        for k in range(1, len(rows)):
+            ax.axhline(k - 0.5, color="white", linewidth=1)
+        ax.set_yticks(range(len(rows)))
+        ax.set_yticklabels([f"{b.key} (order {b.order})" for b, _ in rows], fontsize=8)
+        ax.set_xticks(range(0, 361, 45))
+        ax.set_ylabel("branch")
+        ax.grid(False)
+        more = f" (first 40 of {len(groups[steep])})" if len(groups[steep]) > 40 else ""
+        if steep:
+            ax.set_xlabel("direction that was seen [°], counter-clockwise from +x of the map")
+            ax.set_title("Steep branches and trunks: seen from which direction" + more)
+        else:
+            ax.set_xlabel("side that was seen [°]: 0 and 360 the upper side, 180 the lower")
+            ax.set_title("Lying branches: seen from above, below or a side" + more)
+    fig.tight_layout(rect=(0, 0, 0.9, 1))
+    bar = fig.colorbar(picture, cax=fig.add_axes([0.92, 0.25, 0.018, 0.5]))
+    bar.set_label("share of the measured length")
+    return fig
+
+
+def arc_figure(branches):
+    """How much of the way round every branch was seen, from the tables alone."""
     shown = branches[:40]
     fig, ax = plt.subplots(figsize=(6.2, 1.3 + 0.24 * len(shown)))
     for i, branch in enumerate(shown):
@@ -353,7 +424,7 @@ def all_figures(map_dir, truth=None, scores=None):
             yield (f"taper{suffix}", "Diameter of the trunk over its height, with intervals.",
                    taper_figure(map_dir, tree, true_trunk(map_dir, truth, scores, tree)))
         if any(b.measured.any() for b in map_dir.branches):
-            yield "coverage", "How much of the way round each branch was seen.", coverage_figure(map_dir)
+            yield "coverage", "Which side of each branch was seen.", coverage_figure(map_dir)
     if scores and scores["branches"].get("matched"):
         yield "radius", "Radius of every found branch against the truth.", radius_figure(scores)
     if map_dir.trajectory:

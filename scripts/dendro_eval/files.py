@@ -94,9 +94,40 @@ class MapDirectory:
         self.trees = self._optional("trees.csv", lambda p: read_csv(p, ["tree_id", "dbh_m", "height_m"]))
         self.trajectory = self._optional("trajectory.tum", read_trajectory)
         self.timing = self._optional("timing.json", self._read_json)
+        self._document = None
 
     def file(self, name):
         return os.path.join(self.path, name)
+
+    def document(self):
+        """tree_map.json, or None where it is missing. Read when first asked for: it can be large."""
+        if self._document is None:
+            self._document = self._optional("tree_map.json", self._read_json) or {}
+        return self._document or None
+
+    def directions_seen(self):
+        """{branch id: [(length [m], axis (3,), seen (36,) bool)]} of the measured cylinders, or None.
+
+        The bins are 10 degrees each around the landmark's axis, from the first vector of
+        perpendicular_basis(axis).
+        """
+        document = self.document()
+        if document is None:
+            return None
+        try:
+            landmarks = {m["id"]: (np.array(m["axis"], float), np.array([c == "1" for c in m["arc_seen"]]))
+                         for m in document["landmarks"]}
+            # bitset text: bin 0 is the last digit
+            result = {}
+            for c in document["cylinders"]:
+                if c["landmark_id"] not in landmarks:
+                    continue
+                axis, seen = landmarks[c["landmark_id"]]
+                length = float(np.linalg.norm(np.subtract(c["end"], c["start"])))
+                result.setdefault(c["branch_id"], []).append((length, axis, seen[::-1]))
+            return result
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{self.file('tree_map.json')}: {error!r}") from None
 
     def _optional(self, name, reader):
         path = self.file(name)
@@ -171,10 +202,10 @@ class Truth:
         if not os.path.isdir(path):
             raise InputError(f"{path}: no such truth directory")
         self.missing = {}
-        self.tree_names, self.branches = None, None
+        self.tree_names, self.branches, self.ground = None, None, None
         scene = self.file("scene.yaml")
         if os.path.exists(scene):
-            self.tree_names, self.branches = read_scene(scene)
+            self.tree_names, self.branches, self.ground = read_scene(scene)
         else:
             self.missing["scene.yaml"] = "scene.yaml is not in the truth directory"
         self.trajectory, self.hits = None, None
@@ -203,7 +234,7 @@ class Truth:
 
 
 def read_scene(path):
-    """(tree names, branches) of a scene file."""
+    """(tree names, branches, ground) of a scene file."""
     try:
         with open(path, encoding="utf-8") as stream:
             scene = yaml.load(stream, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -231,7 +262,7 @@ def read_scene(path):
                 raise InputError(f"{path}: branch {above.key[1]}: parent {above.parent[1]} does not exist")
             above = by_key[above.parent]
             branch.order += 1
-    return names, branches
+    return names, branches, (scene or {}).get("ground")
 
 
 def read_label_file(path, magic, ids):

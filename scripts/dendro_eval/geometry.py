@@ -3,6 +3,18 @@
 import numpy as np
 
 
+def perpendicular_basis(axis):
+    """The two unit vectors that the map counts directions around an axis from, shape (3, 2).
+
+    Duff et al., "Building an orthonormal basis, revisited" (JCGT 2017), as PerpendicularBasis of the core.
+    """
+    x, y, z = axis
+    sign = float(np.copysign(1.0, z))
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+
+
 class Chain:
     """A branch as frusta from base to tip.
 

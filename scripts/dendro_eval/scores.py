@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from .errors import InputError
 from .files import parse_stamp, read_csv, read_label_file, read_segment_file
 from .geometry import Chain, axis_angle_deg, inverse, rotation_angle_deg
+from .ground import ground_height
 
 SAMPLE_M = 0.02          # step along an estimate
 MAX_AXIS_DEG = 15.0      # of a match
@@ -225,6 +226,7 @@ def branch_scores(map_dir, truth, T_truth_map):
     truth_of = {e.key: t.key for e, t, _, _, _ in matches}
     angles = {int(r["branch_id"]): float(r["angle_deg"]) for r in map_dir.branch_rows or []
               if r.get("angle_deg")}
+    bases = {int(r["branch_id"]): r for r in map_dir.branch_rows or [] if r.get("base_diameter_m")}
     scores["false"] = len(estimates) - len(matches)
     if truth.hits is None:
         observable = None
@@ -257,6 +259,14 @@ def branch_scores(map_dir, truth, T_truth_map):
             "length_true_m": chain_true.length, "length_m": estimate.chain.length,
             "order_true": true.order, "order": estimate.order if estimate.tree is not None else None,
         }
+        base = bases.get(estimate.key)
+        if base is not None:
+            # The true diameter where the map's branch begins, which may be off the junction.
+            start = T_truth_map[:3, :3] @ estimate.chain.start[0] + T_truth_map[:3, 3]
+            _, _, radius_there, _, _ = chain_true.project(start[None])
+            detail["base_diameter_true_m"] = 2.0 * float(radius_there[0])
+            detail["base_diameter_m"] = float(base["base_diameter_m"])
+            detail["base_diameter_sigma_m"] = float(base["base_diameter_sigma_m"])
         if true.parent is not None:
             parent_observable = observable is None or true.parent in observable
             detail["parent_correct"] = (
@@ -331,7 +341,11 @@ def tree_scores(map_dir, truth, details):
                       if d["tree"] == index and d["branch"] == trunk.key[1]), None)
         row = rows.get(tree_of.get(match["branch_id"])) if match else None
         height = float(row["dbh_height_m"]) if row and row.get("dbh_height_m") else BREAST_HEIGHT_M
-        radius = radius_at_height(trunk.chain, height)
+        # Heights count from the ground: a stem may begin a little below it.
+        start = trunk.chain.start[0]
+        ground = ground_height(truth.ground, float(start[0]), float(start[1]))
+        foot = 0.0 if ground is None else max(0.0, ground - float(start[2]))
+        radius = radius_at_height(trunk.chain, height + foot)
         if radius is None:
             explain(entry, f"the true trunk does not pass {height} m", ["dbh_truth_m"])
         else:
@@ -349,7 +363,7 @@ def tree_scores(map_dir, truth, details):
                 explain(entry, "the trunk was not measured at breast height", ["dbh_m", "dbh_sigma_m"])
             top = max(max(b.chain.start[:, 2].max(), b.chain.end[:, 2].max())
                       for b in truth.branches if b.tree == index)
-            entry["height_error_m"] = float(row["height_m"]) - float(top - trunk.chain.start[0, 2])
+            entry["height_error_m"] = float(row["height_m"]) - float(top - start[2] - foot)
         result.append(entry)
     return result
 

@@ -11,6 +11,9 @@ ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)
 sys.path.insert(0, os.path.join(ROOT, "scripts"))
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
+from dendro_eval.files import MapDirectory, Truth  # noqa: E402
+from dendro_eval.ground import ground_height  # noqa: E402
+from dendro_eval.scores import evaluate  # noqa: E402
 from map_maker import MAP, write_labels, write_map, write_segments, write_truth  # noqa: E402
 
 
@@ -238,3 +241,22 @@ def test_figures(tmp_path):
     figures = sorted(os.listdir(tmp_path / "map" / "figures"))
     assert "tree.png" in figures and "radius.png" in figures and "trajectory.png" in figures
     assert all(os.path.getsize(tmp_path / "map" / "figures" / f) > 5000 for f in figures)
+
+
+def test_breast_height_counts_from_the_ground(tmp_path):
+    # The generator starts a stem 15 cm below the ground; base and ground of generate_scene --seed 101.
+    rough = {"type": "rough", "z": 0, "amplitude_m": 0.09542878844224682, "wavelength_m": 3.1343234263842414,
+             "seed": 101}
+    assert ground_height(rough, 0.0, 0.0) == pytest.approx(-0.1479151 + 0.15, abs=1e-6)
+    assert ground_height({"type": "plane", "z": 0.4}, 3, 4) == 0.4
+    assert ground_height({"type": "none"}, 0, 0) is None and ground_height(None, 0, 0) is None
+    # TREE's trunk thins by 1 cm per metre: 10 cm of it in the ground make 2 mm of diameter at breast height.
+    write_truth(tmp_path / "truth")
+    write_map(tmp_path / "map")
+    scene = tmp_path / "truth" / "scene.yaml"
+    plain = scene.read_text()
+    for z, expected, height in ((None, 0.374, 0.0), (-0.5, 0.374, 0.0), (0.1, 0.372, 0.1)):
+        scene.write_text(plain + ("" if z is None else f"ground: {{type: plane, z: {z}}}\n"))
+        tree = evaluate(MapDirectory(str(tmp_path / "map")), Truth(str(tmp_path / "truth")))["trees"][0]
+        assert tree["dbh_truth_m"] == pytest.approx(expected, abs=1e-9)
+        assert tree["height_error_m"] == pytest.approx(height, abs=1e-6)

@@ -1,9 +1,11 @@
 """scripts/report.py: the report is whole and self-contained; bad tape files are named by their line."""
 
+import json
 import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
@@ -11,8 +13,11 @@ sys.path.insert(0, os.path.join(ROOT, "scripts"))
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 from dendro_eval.errors import InputError  # noqa: E402
-from dendro_eval.files import MapDirectory  # noqa: E402
+from dendro_eval.figures import sides_seen  # noqa: E402
+from dendro_eval.files import MapDirectory, Truth  # noqa: E402
+from dendro_eval.geometry import perpendicular_basis  # noqa: E402
 from dendro_eval.tape import compare_tape  # noqa: E402
+from dendro_eval.thesis import mean_errors, thesis_table  # noqa: E402
 from map_maker import write_map, write_truth  # noqa: E402
 
 
@@ -65,6 +70,66 @@ def test_tape_by_hand(tmp_path):
     assert rows[1]["map_m"] == pytest.approx(0.19, abs=1e-6)
     path.write_text("height,radius_cm\n9,10\n")
     assert compare_tape(str(path), MapDirectory(str(tmp_path / "map")))[0]["note"] == "not seen there"
+
+
+def test_coverage_says_which_side(tmp_path):
+    # An upright trunk seen from +y only, and a level branch along +y seen from below only.
+    for axis, wanted, steep in (((0, 0, 1.0), (0, 1.0, 0), True), ((0, 0, -1.0), (0, 1.0, 0), True),
+                                ((0, 1.0, 0), (0, 0, -1.0), False), ((0, 0.8, 0.6), (0, 0.6, -0.8), False)):
+        axis, wanted = np.array(axis), np.array(wanted)
+        angle = 2 * np.pi * (np.arange(36) + 0.5) / 36
+        around = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ perpendicular_basis(axis).T
+        assert np.allclose(around @ axis, 0, atol=1e-12)
+        seen = around @ wanted > np.cos(np.radians(45))
+        share = sides_seen([(2.0, axis, seen), (1.0, axis, np.zeros(36, bool))], steep)
+        middle = 90 if steep else 180  # counter-clockwise from +x; from the upper side
+        centres = 10 * np.arange(36) + 5
+        inside = np.abs(centres - middle) < 40
+        assert np.allclose(share[inside], 2 / 3) and np.allclose(share[np.abs(centres - middle) > 50], 0)
+    write_map(tmp_path / "map")
+    document = {"landmarks": [{"id": 5, "axis": [0, 0, 1], "arc_seen": "0" * 35 + "1"}],
+                "cylinders": [{"id": 0, "branch_id": 0, "landmark_id": 5, "start": [0, 0, 0], "end": [0, 0, 4]},
+                              {"id": 1, "branch_id": 1, "landmark_id": -1, "start": [0, 0, 0], "end": [1, 0, 4]}]}
+    (tmp_path / "map" / "tree_map.json").write_text(json.dumps(document))
+    pieces = MapDirectory(str(tmp_path / "map")).directions_seen()
+    assert list(pieces) == [0]
+    length, _, seen = pieces[0][0]
+    assert length == 4 and seen[0] and seen.sum() == 1  # bin 0 is the text's last digit
+    run(tmp_path / "map")
+    (tmp_path / "map" / "tree_map.json").write_text("{")
+    assert "tree_map.json" in run(tmp_path / "map", expect=2)
+
+
+def test_the_tables_of_the_thesis(tmp_path):
+    # A palo verde of straight branches, and a map whose left branch is 3 mm too thick.
+    tree = {0: (None, [(0, 0, 0, 0.1556), (0, 0, 1, 0.1556)]),
+            1: (0, [(0, 0, 1, 0.0809), (-2, 0, 3, 0.0809)]),
+            2: (0, [(0, 0, 1, 0.1132), (1, 0, 2.2, 0.1132)]),
+            3: (2, [(1, 0, 2.2, 0.095), (1, 1, 4, 0.095)]),
+            4: (2, [(1, 0, 2.2, 0.0607), (2.5, -0.5, 3.5, 0.0607)])}
+    write_truth(tmp_path / "truth", tree=tree)
+    scene = tmp_path / "truth" / "scene.yaml"
+    scene.write_text(scene.read_text().replace("test_tree", "palo_verde"))
+    branches = {k: (p, 0 if p is None else 1, [(*q[:3], q[3] + (0.003 if k == 1 else 0)) for q in points])
+                for k, (p, points) in tree.items() if k != 4}
+    write_map(tmp_path / "map", branches=branches, turn_deg=30, shift=(5, -2, 1))
+    entry = thesis_table(MapDirectory(str(tmp_path / "map")), Truth(str(tmp_path / "truth")))
+    rows = {r["name"]: r for r in entry["rows"]}
+    assert [r["thesis_cm"] for r in entry["rows"]] == [14.51, 8.79, 12.56, 9.07, 5.24]
+    assert rows["Base"]["ours_cm"] == pytest.approx(15.56, abs=0.01) and rows["Base"]["branches"] == [0]
+    assert rows["Left"]["ours_cm"] == pytest.approx(8.39, abs=0.01)
+    assert rows["RightRight"]["ours_cm"] is None and rows["RightRight"]["found_share"] == 0
+    # The thesis: 0.49 cm to the nearest bound, 0.85 cm to the middle.
+    bound, middle = mean_errors(entry["rows"], "thesis_cm")
+    assert bound == pytest.approx(0.486, abs=1e-6) and middle == pytest.approx(0.851, abs=1e-6)
+    bound, middle = mean_errors(entry["rows"], "ours_cm")
+    assert bound == pytest.approx(0.0, abs=1e-6) and middle == pytest.approx((0.305 + 0.005) / 4, abs=0.01)
+    run(tmp_path / "map", "--truth", tmp_path / "truth")
+    page = (tmp_path / "map" / "report.html").read_text()
+    assert "Table 5.2: palo verde" in page and "not found" in page and "14.51" in page
+    # Another scene has no such table.
+    scene.write_text(scene.read_text().replace("palo_verde", "oak"))
+    assert thesis_table(MapDirectory(str(tmp_path / "map")), Truth(str(tmp_path / "truth"))) is None
 
 
 @pytest.mark.parametrize("text, words", [
