@@ -1,14 +1,23 @@
 #!/usr/bin/env python3
-"""Runs pose graphs through solve_g2o and through GTSAM's iSAM2 in one run and prints the ratios.
+"""Runs factor graphs through this package and through GTSAM in one run and prints the ratios.
 
-    scripts/benchmark_graph.py [GRAPH.g2o ...] [--solver PATH] [--repeat N] [--json]
+    scripts/benchmark_graph.py [GRAPH.g2o ...] [--programs DIR] [--repeat N] [--json]
+    scripts/benchmark_graph.py --laps [--minutes M] [--json]
 
-Needs the gtsam wheel in the Python that runs it, e.g.
-    python3 -m venv venv && venv/bin/pip install gtsam numpy && venv/bin/python scripts/benchmark_graph.py
-Both sides add pose by pose (a pose starts where the edge from the latest pose puts it), on one
-thread. Times are processor time of the update calls alone, so that what else runs on the machine
+Needs the gtsam wheel in the Python that runs it:
+    scripts/setup_oracles gtsam && build/oracles/bin/python scripts/benchmark_graph.py
+Pose graphs (the default): solve_g2o against iSAM2, and against one Gauss-Newton and one
+Levenberg-Marquardt iteration of GTSAM from chordal initialisation. Both sides add pose by pose (a pose
+starts where the edge from the latest pose puts it), on one thread. Times are processor time of the update calls alone, so that what else runs on the machine
 weighs little; sides take turns. iSAM2: relinearizeThreshold 0.1, relinearizeSkip 1 and 10; ratios
 are against the better of the two.
+
+Laps: `cylinder_workload`, ten minutes of laps around the same trees. GTSAM has no cylinders, and
+factors written in Python would be no fair peer; so both sides get the ends of the cylinders as
+points (two point observations, 6 residuals, where this package alone would use one cylinder factor of
+5), GTSAM by its BearingRangeFactor3D with the same isotropic noise. Each side is a process of its own,
+and memory is the peak of the process less what it had before the first update. The runs of this package
+with real cylinders, on every scan and on key frames at 2 Hz, stand beside.
 """
 import argparse
 import collections
@@ -68,15 +77,16 @@ def run_isam2(path, skip):
     return result
 
 
-def batch_iteration_gtsam(path):
-    """Processor time of one Gauss-Newton iteration from chordal initialisation."""
+def batch_iteration_gtsam(path, levenberg_marquardt):
+    """Processor time of one iteration from chordal initialisation."""
     import gtsam
     graph, initial = gtsam.readG2o(str(path), True)
     first = min(initial.keys())
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
     graph.add(gtsam.PriorFactorPose3(first, initial.atPose3(first), noise))
     start = gtsam.InitializePose3.initialize(graph)
-    optimizer = gtsam.GaussNewtonOptimizer(graph, start)
+    optimizer = (gtsam.LevenbergMarquardtOptimizer(graph, start) if levenberg_marquardt
+                 else gtsam.GaussNewtonOptimizer(graph, start))
     times = []
     for _ in range(4):
         begin = time.process_time()
@@ -102,6 +112,122 @@ def run_own(solver, path, incremental):
     return result
 
 
+def read_scans(path):
+    """The measurements that cylinder_workload --write leaves, one list a scan, read as they are used."""
+    scan = []
+    with open(path) as lines:
+        for line in lines:
+            word, *rest = line.split()
+            if word != "SCAN":
+                scan.append((word, [float(x) for x in rest]))
+            elif scan:
+                yield scan
+                scan = []
+    yield scan
+
+
+def run_isam2_points(path, skip):
+    import resource
+
+    import gtsam
+    import numpy as np
+
+    def pose(v):
+        return gtsam.Pose3(gtsam.Rot3.Quaternion(v[6], v[3], v[4], v[5]), np.array(v[:3]))
+
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(0.1)
+    params.relinearizeSkip = skip
+    isam = gtsam.ISAM2(params)
+    seconds, known = [], set()
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    for k, scan in enumerate(read_scans(path)):
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        key = gtsam.symbol("x", k)
+        for word, v in scan:
+            if word == "PRIOR":
+                T = pose(v)
+                graph.add(gtsam.PriorFactorPose3(key, T, gtsam.noiseModel.Isotropic.Sigma(6, v[7])))
+                values.insert(key, T)
+            elif word == "ODOMETRY":
+                noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([v[7]] * 3 + [v[8]] * 3))
+                previous = gtsam.symbol("x", k - 1)
+                T = isam.calculateEstimatePose3(previous).compose(pose(v))
+                graph.add(gtsam.BetweenFactorPose3(previous, key, pose(v), noise))
+                values.insert(key, T)
+            else:
+                point, sigma = np.array(v[1:4]), v[4]
+                distance = np.linalg.norm(point)
+                landmark = gtsam.symbol("l", int(v[0]))
+                noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma / distance] * 2 + [sigma]))
+                graph.add(gtsam.BearingRangeFactor3D(key, landmark, gtsam.Unit3(point), distance, noise))
+                if v[0] not in known:
+                    known.add(v[0])
+                    values.insert(landmark, T.transformFrom(point))
+        start = time.process_time()
+        isam.update(graph, values)
+        seconds.append(time.process_time() - start)
+    result = summarize(seconds)
+    result["seconds"] = seconds
+    result["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    result["peak_memory_before_mb"] = before_mb
+    result["half_chi2"] = isam.getFactorsUnsafe().error(isam.calculateEstimate())
+    return result
+
+
+def run_laps(programs, minutes, as_json):
+    import numpy as np
+    workload = programs / "cylinder_workload"
+
+    def own(*options):
+        command = [str(workload), "--minutes", str(minutes), "--json", *options]
+        return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+    def used_mb(result):
+        """What the graph and the solver took: not the interpreter, the libraries and the measurements."""
+        return result["peak_memory_mb"] - result["peak_memory_before_mb"]
+
+    report = {}
+    with tempfile.TemporaryDirectory() as folder:
+        measurements = os.path.join(folder, "measurements.txt")
+        report["own_points"] = own("--landmarks", "points", "--write", measurements)
+        for skip in (1, 10):
+            output = subprocess.run([sys.executable, __file__, "--isam2-points", measurements, "--skip", str(skip)],
+                                    check=True, capture_output=True, text=True).stdout
+            peer = json.loads(output)
+            seconds = 1e3 * np.asarray(peer.pop("seconds"))
+            per_minute = max(1, round(len(seconds) / minutes))
+            peer["minutes"] = [{"median_ms": float(np.median(part)), "p99_ms": float(np.percentile(part, 99)),
+                                "max_ms": float(part.max())}
+                               for part in np.split(seconds, range(per_minute, len(seconds), per_minute))]
+            report[f"isam2_skip_{skip}"] = peer
+    report["own_cylinders"] = own("--landmarks", "cylinders")
+    report["own_key_frames"] = own("--landmarks", "cylinders", "--key-frame-hz", "2")
+    points = report["own_points"]
+    peers = [report["isam2_skip_1"], report["isam2_skip_10"]]
+    last = points["minutes"][-1]["p99_ms"]
+    report["ratio_total"] = points["total_cpu_s"] / min(p["total_s"] for p in peers)
+    report["ratio_p99_last_minute"] = last / min(p["minutes"][-1]["p99_ms"] for p in peers)
+    report["ratio_p99_last_to_first_minute"] = last / points["minutes"][0]["p99_ms"]
+    report["ratio_memory"] = (used_mb(points) /
+                              min(used_mb(p) for p in peers))
+    report["ratio_error"] = points["half_chi2"] / min(p["half_chi2"] for p in peers)
+    full, frames = report["own_cylinders"]["radii_m"], report["own_key_frames"]["radii_m"]
+    report["key_frame_radius_difference_max_m"] = max(abs(a - b) for a, b in zip(full, frames))
+    if as_json:
+        print(json.dumps(report, indent=2))
+        return
+    for name, r in report.items():
+        if isinstance(r, dict):
+            first, end = r["minutes"][0], r["minutes"][-1]
+            print(f"{name:15s} total {r.get('total_s', r.get('total_cpu_s')):8.2f} s   p99 in the first minute "
+                  f"{first['p99_ms']:7.2f} ms, in the last {end['p99_ms']:7.2f} ms   memory "
+                  f"{used_mb(r):6.1f} MB   1/2 chi2 {r['half_chi2']:.3f}")
+    for name, r in report.items():
+        if not isinstance(r, dict):
+            print(f"{name:34s} {r:.4f}")
+
+
 def best_of(repeat, call):
     results = [call() for _ in range(repeat)]
     return min(results, key=lambda r: r.get("iteration_s", r.get("total_s")))
@@ -115,18 +241,30 @@ def show(name, r):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("graphs", nargs="*", type=pathlib.Path)
-    parser.add_argument("--solver", type=pathlib.Path,
-                        default=ROOT / "build/devel/lib/dendro_slam/solve_g2o")
+    parser.add_argument("--programs", type=pathlib.Path, default=ROOT / "build/devel/lib/dendro_slam",
+                        help="folder of solve_g2o and cylinder_workload")
+    parser.add_argument("--laps", action="store_true", help="the laps around trees instead of pose graphs")
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the laps")
+    parser.add_argument("--isam2-points", type=pathlib.Path, help=argparse.SUPPRESS)
+    parser.add_argument("--skip", type=int, default=1, help=argparse.SUPPRESS)
     parser.add_argument("--repeat", type=int, default=1, help="best of N runs of each side")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     args = parser.parse_args()
     try:
         import gtsam  # noqa: F401
     except ImportError:
-        sys.exit("benchmark_graph: this Python has no gtsam; pip install gtsam numpy into a virtual "
-                 "environment and run the script with its python")
-    if not args.solver.exists():
-        sys.exit(f"benchmark_graph: {args.solver} is missing; run scripts/build solve_g2o first")
+        sys.exit("benchmark_graph: this Python has no gtsam; run scripts/setup_oracles gtsam and then the "
+                 "script with build/oracles/bin/python")
+    if args.isam2_points:
+        print(json.dumps(run_isam2_points(args.isam2_points, args.skip)))
+        return
+    for program in ["cylinder_workload"] if args.laps else ["solve_g2o"]:
+        if not (args.programs / program).exists():
+            sys.exit(f"benchmark_graph: {args.programs / program} is missing; run scripts/build {program} first")
+    if args.laps:
+        run_laps(args.programs, args.minutes, args.json)
+        return
+    solver = args.programs / "solve_g2o"
     shared = pathlib.Path(os.environ.get("DENDRO_SHARED_DATA", ROOT / "../shared/data"))
     graphs = args.graphs or [shared / "posegraph" / name for name in DEFAULT_GRAPHS]
     report = {}
@@ -134,11 +272,12 @@ def main():
         if not path.exists():
             sys.exit(f"benchmark_graph: {path} is missing; name g2o files on the command line")
         entry = {
-            "own": best_of(args.repeat, lambda: run_own(args.solver, path, True)),
+            "own": best_of(args.repeat, lambda: run_own(solver, path, True)),
             "isam2_skip_1": best_of(args.repeat, lambda: run_isam2(path, 1)),
             "isam2_skip_10": best_of(args.repeat, lambda: run_isam2(path, 10)),
-            "own_batch": best_of(args.repeat, lambda: run_own(args.solver, path, False)),
-            "gtsam_batch": best_of(args.repeat, lambda: batch_iteration_gtsam(path)),
+            "own_batch": best_of(args.repeat, lambda: run_own(solver, path, False)),
+            "gtsam_batch": best_of(args.repeat, lambda: batch_iteration_gtsam(path, True)),
+            "gtsam_batch_gauss_newton": best_of(args.repeat, lambda: batch_iteration_gtsam(path, False)),
         }
         peers = [entry["isam2_skip_1"], entry["isam2_skip_10"]]
         entry["ratio_total"] = entry["own"]["total_s"] / min(p["total_s"] for p in peers)
@@ -151,7 +290,8 @@ def main():
             show("iSAM2 skip 1", entry["isam2_skip_1"])
             show("iSAM2 skip 10", entry["isam2_skip_10"])
             print(f"  batch iteration    own {1e3 * entry['own_batch']['iteration_s']:.1f} ms, "
-                  f"GTSAM {1e3 * entry['gtsam_batch']['iteration_s']:.1f} ms")
+                  f"GTSAM Levenberg-Marquardt {1e3 * entry['gtsam_batch']['iteration_s']:.1f} ms, "
+                  f"Gauss-Newton {1e3 * entry['gtsam_batch_gauss_newton']['iteration_s']:.1f} ms")
             print(f"  ratios             total {entry['ratio_total']:.2f}   p99 {entry['ratio_p99']:.2f}   "
                   f"batch iteration {entry['ratio_batch_iteration']:.2f}", flush=True)
     if args.json:

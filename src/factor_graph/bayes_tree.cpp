@@ -26,7 +26,7 @@ double FrontCost(double n, double f) {
 }  // namespace
 
 void BayesTree::MarkStructural(int variable) {
-  MarkStructuralClique(graph_->variables[variable].clique);
+  MarkStructuralClique(graph_->states[variable].clique);
 }
 
 void BayesTree::MarkStructuralClique(int clique) {
@@ -64,7 +64,8 @@ void BayesTree::Clear() {
   structural_.clear();
   dirty_.clear();
   factorized_.clear();
-  for (VariableRecord& v : graph_->variables) v.clique = -1;
+  spare_.clear();
+  for (VariableState& v : graph_->states) v.clique = -1;
 }
 
 int BayesTree::NewClique() {
@@ -77,11 +78,30 @@ int BayesTree::NewClique() {
   return c;
 }
 
+// Gives an empty buffer room for `size` doubles, from a dissolved clique if one fits: large blocks
+// that go back to the system and come again cost more than the arithmetic on them.
+void BayesTree::Reserve(std::size_t size, std::vector<double>* buffer) {
+  if (buffer->capacity() >= size) return;
+  auto best = spare_.end();
+  for (auto it = spare_.begin(); it != spare_.end(); ++it) {
+    if (it->capacity() < size || it->capacity() > size + size / 2) continue;
+    if (best == spare_.end() || it->capacity() < best->capacity()) best = it;
+  }
+  if (best == spare_.end()) {
+    buffer->reserve(size);
+    return;
+  }
+  std::swap(*best, spare_.back());
+  *buffer = std::move(spare_.back());
+  spare_.pop_back();
+}
+
 int BayesTree::Restructure(const std::vector<int>& new_variables,
                            const std::vector<int>& new_factors,
                            const std::vector<int>& groups,
                            int epoch) {
   std::vector<VariableRecord>& variables = graph_->variables;
+  std::vector<VariableState>& states = graph_->states;
   std::vector<FactorRecord>& factors = graph_->factors;
   local_.resize(variables.size(), -1);
   offset_.resize(variables.size(), -1);
@@ -94,7 +114,7 @@ int BayesTree::Restructure(const std::vector<int>& new_variables,
     Clique& clique = cliques_[c];
     for (int i = 0; i < clique.num_frontal; ++i) {
       const int v = clique.variables[i];
-      if (variables[v].alive && variables[v].clique == c) part.push_back(v);
+      if (variables[v].alive && states[v].clique == c) part.push_back(v);
     }
     for (const int f : clique.factors) {
       if (factors[f].factor) part_factors.push_back(f);
@@ -105,7 +125,11 @@ int BayesTree::Restructure(const std::vector<int>& new_variables,
   }
   part.insert(part.end(), new_variables.begin(), new_variables.end());
   part_factors.insert(part_factors.end(), new_factors.begin(), new_factors.end());
+  spare_.clear();
   for (const int c : structural_) {
+    for (std::vector<double>* buffer : {&cliques_[c].conditional, &cliques_[c].marginal}) {
+      if (buffer->capacity() > 0) spare_.push_back(std::move(*buffer));
+    }
     if (cliques_[c].parent < 0) roots_.erase(std::find(roots_.begin(), roots_.end(), c));
     cliques_[c] = Clique();
     free_.push_back(c);
@@ -202,9 +226,9 @@ int BayesTree::Restructure(const std::vector<int>& new_variables,
   std::vector<int> child_list;
   for (int p = 0; p < n; ++p) {
     Node& node = nodes[p];
-    node.f = variables[ordered[p]].dimension;
+    node.f = states[ordered[p]].dimension;
     node.n = node.f;
-    for (const int q : separators[p]) node.n += variables[ordered[q]].dimension;
+    for (const int q : separators[p]) node.n += states[ordered[q]].dimension;
     child_list.clear();
     for (int child = first_child[p]; child >= 0; child = next_sibling[child]) {
       child_list.push_back(child);
@@ -249,14 +273,14 @@ int BayesTree::Restructure(const std::vector<int>& new_variables,
     for (const int q : node.frontal) {
       node_of[q] = c;
       const int v = ordered[q];
-      variables[v].clique = c;
+      states[v].clique = c;
       clique.variables.push_back(v);
-      clique.frontal_dimension += variables[v].dimension;
+      clique.frontal_dimension += states[v].dimension;
     }
     for (const int q : separators[p]) {
       const int v = ordered[q];
       clique.variables.push_back(v);
-      clique.separator_dimension += variables[v].dimension;
+      clique.separator_dimension += states[v].dimension;
     }
     clique_of_head[p] = c;
     clique.children.reserve(node.children.size());
@@ -315,7 +339,7 @@ int BayesTree::Factorize(const Damping& damping) {
 }
 
 bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* failed) {
-  const std::vector<VariableRecord>& variables = graph_->variables;
+  const std::vector<VariableState>& states = graph_->states;
   const int frontal = clique->frontal_dimension;
   const int separator = clique->separator_dimension;
   const int rhs = frontal + separator;
@@ -323,13 +347,18 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
   const int stride = FrontStride(size);
   const std::size_t cells = static_cast<std::size_t>(stride) * stride;
   if (front_.size() < cells) front_.resize(cells);
-  std::memset(front_.data(), 0, sizeof(double) * cells);
+  // The lower triangle alone; what is above it is never read into a result.
+  for (int j = 0; j < stride; ++j) {
+    std::memset(front_.data() + static_cast<std::size_t>(j) * stride + j, 0,
+                sizeof(double) * static_cast<std::size_t>(stride - j));
+  }
 
   int offset = 0;
   for (const int v : clique->variables) {
     offset_[v] = offset;
-    offset += variables[v].dimension;
+    offset += states[v].dimension;
   }
+  for (int i = 0; i < clique->num_frontal; ++i) AddUnary(clique->variables[i], stride, rhs);
   for (const int f : clique->factors) AddFactor(graph_->factors[f], stride, rhs);
   for (const int child : clique->children) AddMarginal(cliques_[child], stride, rhs);
 
@@ -341,12 +370,12 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
     offset = 0;
     for (int i = 0; i < clique->num_frontal; ++i) {
       const int v = clique->variables[i];
-      for (int k = 0; k < variables[v].dimension; ++k, ++offset) {
+      for (int k = 0; k < states[v].dimension; ++k, ++offset) {
         const double d =
             damping.lambda * (*damping.weights)[static_cast<std::size_t>(v) * kMaxTangentDimension + k];
         double* column = front_.data() + static_cast<std::size_t>(offset) * stride;
         column[offset] += d;
-        column[rhs] += d * variables[v].delta[k];
+        column[rhs] += d * states[v].delta[k];
       }
     }
   }
@@ -355,13 +384,14 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
   if (column >= 0) {
     for (int i = 0; i < clique->num_frontal; ++i) {
       const int v = clique->variables[i];
-      if (column < offset_[v] + variables[v].dimension) {
+      if (column < offset_[v] + states[v].dimension) {
         *failed = v;
         return false;
       }
     }
   }
 
+  Reserve(static_cast<std::size_t>(size) * frontal, &clique->conditional);
   clique->conditional.resize(static_cast<std::size_t>(size) * frontal);
   for (int j = 0; j < frontal; ++j) {
     std::memcpy(clique->conditional.data() + static_cast<std::size_t>(j) * size,
@@ -370,6 +400,7 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
   }
   if (separator > 0) {
     const int m = separator + 1;
+    Reserve(static_cast<std::size_t>(m) * (m + 1) / 2, &clique->marginal);
     clique->marginal.resize(static_cast<std::size_t>(m) * (m + 1) / 2);
     double* out = clique->marginal.data();
     for (int j = 0; j < m; ++j) {
@@ -382,19 +413,19 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
 }
 
 void BayesTree::AddFactor(const FactorRecord& factor, int stride, int rhs) {
-  const std::vector<VariableRecord>& variables = graph_->variables;
+  const std::vector<VariableState>& states = graph_->states;
   const double* source = factor.hessian.data();
   const int count = static_cast<int>(factor.variables.size());
   for (int a = 0; a < count; ++a) {
     const int va = factor.variables[a];
-    const int da = variables[va].dimension;
+    const int da = states[va].dimension;
     for (int k = 0; k < da; ++k) {
       const int column = offset_[va] + k;
       double* target = front_.data() + static_cast<std::size_t>(column) * stride;
       for (int r = k; r < da; ++r) target[offset_[va] + r] += *source++;
       for (int b = a + 1; b < count; ++b) {
         const int vb = factor.variables[b];
-        const int db = variables[vb].dimension;
+        const int db = states[vb].dimension;
         const int row = offset_[vb];
         if (row > column) {
           for (int r = 0; r < db; ++r) target[row + r] += *source++;
@@ -409,13 +440,26 @@ void BayesTree::AddFactor(const FactorRecord& factor, int stride, int rhs) {
   }
 }
 
+void BayesTree::AddUnary(int variable, int stride, int rhs) {
+  const std::vector<double>& unary = graph_->variables[variable].unary;
+  if (unary.empty()) return;
+  const double* source = unary.data();
+  const int first = offset_[variable];
+  const int d = graph_->states[variable].dimension;
+  for (int k = 0; k < d; ++k) {
+    double* target = front_.data() + static_cast<std::size_t>(first + k) * stride;
+    for (int r = k; r < d; ++r) target[first + r] += *source++;
+    target[rhs] += *source++;
+  }
+}
+
 void BayesTree::AddMarginal(const Clique& child, int stride, int rhs) {
-  const std::vector<VariableRecord>& variables = graph_->variables;
+  const std::vector<VariableState>& states = graph_->states;
   std::vector<Run>& runs = runs_;
   runs.clear();
   for (std::size_t i = child.num_frontal; i < child.variables.size(); ++i) {
     const int v = child.variables[i];
-    const int length = variables[v].dimension;
+    const int length = states[v].dimension;
     if (!runs.empty() && runs.back().target + runs.back().length == offset_[v]) {
       runs.back().length += length;
     } else {
@@ -451,20 +495,12 @@ void BayesTree::AddMarginal(const Clique& child, int stride, int rhs) {
 
 void BayesTree::SolveClique(const Clique& clique, double* x) const {
   const int frontal = clique.frontal_dimension;
-  const int rhs = frontal + clique.separator_dimension;
-  const std::size_t stride = static_cast<std::size_t>(rhs) + 1;
   int offset = frontal;
   for (std::size_t i = clique.num_frontal; i < clique.variables.size(); ++i) {
-    const VariableRecord& v = graph_->variables[clique.variables[i]];
+    const VariableState& v = graph_->states[clique.variables[i]];
     for (int k = 0; k < v.dimension; ++k) x[offset++] = v.delta[k];
   }
-  for (int j = frontal - 1; j >= 0; --j) {
-    const double* column = clique.conditional.data() + static_cast<std::size_t>(j) * stride;
-    const int length = rhs - j - 1;
-    const double dot = Eigen::Map<const Eigen::VectorXd>(column + j + 1, length)
-                           .dot(Eigen::Map<const Eigen::VectorXd>(x + j + 1, length));
-    x[j] = (column[rhs] - dot) / column[j];
-  }
+  SolveConditional(clique.conditional.data(), frontal, clique.separator_dimension, x);
 }
 
 Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const {
@@ -472,7 +508,7 @@ Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const 
   std::vector<std::pair<int, int>> path;  // (-depth, clique)
   std::vector<char> seen(cliques_.size(), 0);
   for (const int v : selected) {
-    for (int c = graph_->variables[v].clique; c >= 0 && !seen[c]; c = cliques_[c].parent) {
+    for (int c = graph_->states[v].clique; c >= 0 && !seen[c]; c = cliques_[c].parent) {
       seen[c] = 1;
       int depth = 0;
       for (int p = cliques_[c].parent; p >= 0; p = cliques_[p].parent) ++depth;
@@ -486,15 +522,15 @@ Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const 
     const Clique& clique = cliques_[entry.second];
     for (int i = 0; i < clique.num_frontal; ++i) {
       row_of[clique.variables[i]] = rows;
-      rows += graph_->variables[clique.variables[i]].dimension;
+      rows += graph_->states[clique.variables[i]].dimension;
     }
   }
   int columns = 0;
-  for (const int v : selected) columns += graph_->variables[v].dimension;
+  for (const int v : selected) columns += graph_->states[v].dimension;
   Eigen::MatrixXd Y = Eigen::MatrixXd::Zero(rows, columns);
   int column = 0;
   for (const int v : selected) {
-    for (int k = 0; k < graph_->variables[v].dimension; ++k) Y(row_of[v] + k, column++) = 1.0;
+    for (int k = 0; k < graph_->states[v].dimension; ++k) Y(row_of[v] + k, column++) = 1.0;
   }
   for (const auto& entry : path) {
     const Clique& clique = cliques_[entry.second];
@@ -508,7 +544,7 @@ Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const 
     int source = frontal;
     for (std::size_t i = clique.num_frontal; i < clique.variables.size(); ++i) {
       const int v = clique.variables[i];
-      const int d = graph_->variables[v].dimension;
+      const int d = graph_->states[v].dimension;
       const Eigen::Map<const Eigen::MatrixXd, 0, Eigen::OuterStride<>> L21(
           clique.conditional.data() + source, d, frontal, Eigen::OuterStride<>(stride));
       Y.middleRows(row_of[v], d).noalias() -= L21 * y;

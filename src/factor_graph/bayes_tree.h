@@ -98,8 +98,10 @@ class BayesTree {
   };
 
   int NewClique();
+  void Reserve(std::size_t size, std::vector<double>* buffer);
   bool FactorizeClique(Clique* clique, const Damping& damping, int* failed);
   void AddFactor(const FactorRecord& factor, int stride, int rhs);
+  void AddUnary(int variable, int stride, int rhs);
   void AddMarginal(const Clique& child, int stride, int rhs);
 
   GraphStore* graph_;
@@ -116,6 +118,7 @@ class BayesTree {
   std::vector<double> front_;
   std::vector<double> limits_;
   std::vector<Run> runs_;
+  std::vector<std::vector<double>> spare_;  // Memory of the cliques dissolved last.
 };
 
 }  // namespace dendro::internal

@@ -16,14 +16,17 @@ constexpr int kPanel = 48;    // Columns whose update of the rest is delayed int
 constexpr int kSubPanel = 8;  // Columns eliminated one by one.
 constexpr int kTileRows = 12;
 constexpr int kTileColumns = 4;
+constexpr int kSolveColumns = 4;  // Columns of a conditional that share the loads of x.
 
-// The two inner kernels, for one instruction set.
+// The inner kernels, for one instruction set.
 struct Kernels {
   // A(i, j) -= sum over k in [k0, k1) of A(i, k) A(j, k), for the lower triangle of the columns
   // [j0, j1) down to row `size`; may overwrite the upper triangle.
   void (*update)(double* A, std::size_t ld, int size, int k0, int k1, int j0, int j1);
   // Eliminates the columns [k0, k1) within themselves; the failing column or -1.
   int (*eliminate)(double* A, std::size_t ld, int size, int k0, int k1, const double* limits);
+  // sums[c] = sum over i in [0, n) of L(i, c) x(i) for kSolveColumns columns.
+  void (*dots)(const double* L, std::size_t ld, int n, const double* x, double* sums);
 };
 
 inline __attribute__((always_inline)) int EliminateColumns(double* A,
@@ -73,7 +76,56 @@ void UpdatePlain(double* A, std::size_t ld, int size, int k0, int k1, int j0, in
   }
 }
 
+void DotsPlain(const double* L, std::size_t ld, int n, const double* x, double* sums) {
+  double sum[kSolveColumns] = {};
+  for (int i = 0; i < n; ++i) {
+    for (int c = 0; c < kSolveColumns; ++c) sum[c] += L[static_cast<std::size_t>(c) * ld + i] * x[i];
+  }
+  for (int c = 0; c < kSolveColumns; ++c) sums[c] = sum[c];
+}
+
 #ifdef DENDRO_X86_KERNELS
+
+__attribute__((target("avx2,fma"))) void DotsAvx2(const double* L,
+                                                   std::size_t ld,
+                                                   int n,
+                                                   const double* x,
+                                                   double* sums) {
+  __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0;
+  __m256d t0 = s0, t1 = s0, t2 = s0, t3 = s0;
+  const double* l1 = L + ld;
+  const double* l2 = l1 + ld;
+  const double* l3 = l2 + ld;
+  int i = 0;
+  for (; i + 8 <= n; i += 8) {
+    const __m256d a = _mm256_loadu_pd(x + i);
+    const __m256d b = _mm256_loadu_pd(x + i + 4);
+    s0 = _mm256_fmadd_pd(_mm256_loadu_pd(L + i), a, s0);
+    t0 = _mm256_fmadd_pd(_mm256_loadu_pd(L + i + 4), b, t0);
+    s1 = _mm256_fmadd_pd(_mm256_loadu_pd(l1 + i), a, s1);
+    t1 = _mm256_fmadd_pd(_mm256_loadu_pd(l1 + i + 4), b, t1);
+    s2 = _mm256_fmadd_pd(_mm256_loadu_pd(l2 + i), a, s2);
+    t2 = _mm256_fmadd_pd(_mm256_loadu_pd(l2 + i + 4), b, t2);
+    s3 = _mm256_fmadd_pd(_mm256_loadu_pd(l3 + i), a, s3);
+    t3 = _mm256_fmadd_pd(_mm256_loadu_pd(l3 + i + 4), b, t3);
+  }
+  alignas(32) double lanes[4];
+  const auto reduce = [&lanes](__m256d u, __m256d v)
+                          __attribute__((target("avx2,fma"), always_inline)) {
+    _mm256_store_pd(lanes, _mm256_add_pd(u, v));
+    return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]);
+  };
+  sums[0] = reduce(s0, t0);
+  sums[1] = reduce(s1, t1);
+  sums[2] = reduce(s2, t2);
+  sums[3] = reduce(s3, t3);
+  for (; i < n; ++i) {
+    sums[0] += L[i] * x[i];
+    sums[1] += l1[i] * x[i];
+    sums[2] += l2[i] * x[i];
+    sums[3] += l3[i] * x[i];
+  }
+}
 
 __attribute__((target("avx2,fma"))) int EliminateAvx2(double* A,
                                                        std::size_t ld,
@@ -161,16 +213,21 @@ __attribute__((target("avx2,fma"))) void UpdateAvx2(double* A,
 Kernels ChooseKernels() {
 #ifdef DENDRO_X86_KERNELS
   if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
-    return {UpdateAvx2, EliminateAvx2};
+    return {UpdateAvx2, EliminateAvx2, DotsAvx2};
   }
 #endif
-  return {UpdatePlain, EliminatePlain};
+  return {UpdatePlain, EliminatePlain, DotsPlain};
+}
+
+const Kernels& ChosenKernels() {
+  static const Kernels kernels = ChooseKernels();
+  return kernels;
 }
 
 }  // namespace
 
 int PartialCholesky(double* A, int stride, int size, int frontal, const double* limits) {
-  static const Kernels kernels = ChooseKernels();
+  const Kernels& kernels = ChosenKernels();
   const auto ld = static_cast<std::size_t>(stride);
   for (int k = 0; k < frontal; k += kPanel) {
     const int panel_end = std::min(frontal, k + kPanel);
@@ -183,6 +240,31 @@ int PartialCholesky(double* A, int stride, int size, int frontal, const double* 
     if (panel_end < size) kernels.update(A, ld, size, k, panel_end, panel_end, size);
   }
   return -1;
+}
+
+void SolveConditional(const double* L, int frontal, int separator, double* x) {
+  const Kernels& kernels = ChosenKernels();
+  const int rhs = frontal + separator;
+  const auto ld = static_cast<std::size_t>(rhs) + 1;
+  int j = frontal;
+  for (; j >= kSolveColumns; j -= kSolveColumns) {
+    const int first = j - kSolveColumns;
+    const double* block = L + static_cast<std::size_t>(first) * ld;
+    double sums[kSolveColumns];
+    kernels.dots(block + j, ld, rhs - j, x + j, sums);
+    for (int c = kSolveColumns - 1; c >= 0; --c) {
+      const double* column = block + static_cast<std::size_t>(c) * ld + first;
+      double sum = sums[c];
+      for (int i = c + 1; i < kSolveColumns; ++i) sum += column[i] * x[first + i];
+      x[first + c] = (column[rhs - first] - sum) / column[c];
+    }
+  }
+  for (--j; j >= 0; --j) {
+    const double* column = L + static_cast<std::size_t>(j) * ld;
+    double sum = 0.0;
+    for (int i = j + 1; i < rhs; ++i) sum += column[i] * x[i];
+    x[j] = (column[rhs] - sum) / column[j];
+  }
 }
 
 }  // namespace dendro::internal

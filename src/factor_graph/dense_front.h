@@ -17,10 +17,16 @@ inline int FrontStride(int size) { return (size + kFrontPadding + 3) / 4 * 4; }
 ///
 /// Blocked; the inner products run on register tiles, with AVX2 where the processor has it. The
 /// kernels are chosen once, so a machine gives the same bits every time.
-/// @param A       Column-major, shape (stride, stride), stride = FrontStride(size); rows and columns
-///                beyond `size` are zero. The upper triangle is overwritten.
+/// @param A       Column-major, shape (stride, stride), stride = FrontStride(size); the lower triangle's
+///                rows and columns beyond `size` are zero. What is above the diagonal is overwritten
+///                and has no influence.
 /// @param limits  Shape (frontal): a pivot must exceed its limit (and zero).
 /// @return        -1, or the first column whose pivot does not.
 int PartialCholesky(double* A, int stride, int size, int frontal, const double* limits);
+
+/// Solves `L11^T x_f = d - L21^T x_s` of one conditional.
+/// @param L  `[L11; L21; d^T]`, column-major, shape (frontal + separator + 1, frontal).
+/// @param x  In: x_s in the entries from `frontal` on; out: x_f before them.
+void SolveConditional(const double* L, int frontal, int separator, double* x);
 
 }  // namespace dendro::internal

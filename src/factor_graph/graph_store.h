@@ -8,17 +8,26 @@
 
 namespace dendro::internal {
 
-/// A variable as the solver keeps it. Slots are reused after a removal.
+/// What elimination and back-substitution need of a variable, apart from the rest so that they stay
+/// in the cache.
+struct VariableState {
+  double delta[kMaxTangentDimension] = {};      ///< Solution of the linear system at theta.
+  int dimension = 0;
+  int clique = -1;                              ///< Where it is eliminated.
+  double last_unit = 1.0;                       ///< What a change of 1 m is in the last coordinate.
+  double published[kMaxTangentDimension] = {};  ///< The delta that descendants last used.
+};
+
+/// The rest of a variable. Slots are reused after a removal.
 struct VariableRecord {
   Key key = 0;
-  int dimension = 0;
   bool alive = false;
   Value theta;                                ///< Linearisation point.
   Value estimate;                             ///< theta moved by delta.
-  double delta[kMaxTangentDimension] = {};    ///< Solution of the linear system at theta.
-  double published[kMaxTangentDimension] = {};  ///< The delta that descendants last used.
-  int clique = -1;                            ///< Where it is eliminated.
   std::vector<int> factors;                   ///< Slots of its factors, ascending by insertion.
+  /// Sum of the augmented Hessians of the factors on this variable alone, packed, dimension + 1 wide;
+  /// empty for none. A landmark may have thousands: they are not part of the tree.
+  std::vector<double> unary;
 };
 
 /// A factor as the solver keeps it.
@@ -27,13 +36,14 @@ struct FactorRecord {
   std::uint32_t generation = 0;               ///< Of the slot, so that an old id is recognised.
   std::vector<int> variables;
   int columns = 0;
-  int clique = -1;                            ///< Where it is assembled.
+  int clique = -1;                            ///< Where it is assembled; none on one variable.
   /// Augmented Hessian `[A^T A, .; -r^T A, r^T r]` at theta, lower triangle packed by columns,
   /// `columns + 1` wide.
   std::vector<double> hessian;
 };
 
 struct GraphStore {
+  std::vector<VariableState> states;       ///< By variable slot, as `variables`.
   std::vector<VariableRecord> variables;
   std::vector<FactorRecord> factors;
 };

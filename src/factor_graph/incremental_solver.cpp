@@ -22,6 +22,7 @@ using internal::Damping;
 using internal::FactorRecord;
 using internal::GraphStore;
 using internal::VariableRecord;
+using internal::VariableState;
 
 namespace {
 
@@ -47,8 +48,20 @@ constexpr double kSmallRise = 1.1;
 // the optimum as far as the linearisation can tell: the estimate stays, damping would find nothing.
 constexpr double kNegligibleRise = 1e-4;
 
-// A variable stays where it is when it would move by less than this part of the wildfire threshold.
-constexpr double kStillPart = 0.02;
+// A step of which too small a part was taken is taken again with thresholds smaller by this.
+constexpr double kFinePart = 0.02;
+
+// A diagonal entry of which marginalisation leaves less than this part is zero.
+constexpr double kNoInformation = 1e-12;
+
+// Errors are summed in blocks, so that a few changed factors do not cost a sum over all.
+constexpr std::size_t kErrorBlock = 64;
+
+// A change of a cylinder's curvature counts by the change of its radius, |dr| = |dkappa| / kappa^2.
+double LastUnit(const Value& value) {
+  const auto* cylinder = std::get_if<Cylinder>(&value);
+  return cylinder == nullptr ? 1.0 : cylinder->curvature * cylinder->curvature;
+}
 
 bool Lowers(double after, double before) {
   return after <= before * (1.0 + kRelativeRounding) + kAbsoluteRounding;
@@ -65,6 +78,7 @@ void SolverConfig::Validate() const {
   Require(not_negative(relinearize_offset_m), "relinearize_offset_m", ">= 0");
   Require(relinearize_skip >= 1, "relinearize_skip", ">= 1");
   Require(not_negative(wildfire_threshold), "wildfire_threshold", ">= 0");
+  Require(not_negative(still_threshold), "still_threshold", ">= 0");
   Require(max_iterations >= 1, "max_iterations", ">= 1");
   Require(positive(lambda_initial), "lambda_initial", "> 0");
   Require(std::isfinite(lambda_up) && lambda_up > 1.0, "lambda_up", "> 1");
@@ -90,7 +104,7 @@ class IncrementalSolver::Impl {
   Values Estimates() const;
   bool Contains(Key key) const { return slots_.count(key) != 0; }
   Eigen::MatrixXd JointMarginalCovariance(const std::vector<Key>& keys) const;
-  double Error() const { return std::accumulate(errors_.begin(), errors_.end(), 0.0); }
+  double Error() const { return std::accumulate(error_sums_.begin(), error_sums_.end(), 0.0); }
   double FactorError(FactorId id) const { return errors_[FactorSlot(id)]; }
   const FactorPtr& GetFactor(FactorId id) const { return graph_.factors[FactorSlot(id)].factor; }
   bool ContainsFactor(FactorId id) const { return FindFactor(id) >= 0; }
@@ -110,6 +124,8 @@ class IncrementalSolver::Impl {
     std::vector<int> factors;
     std::vector<double> errors;     // Before.
     std::vector<int> cliques;       // Solved.
+
+    void Clear();  // Keeps the memory.
   };
 
   int SlotOf(Key key) const;
@@ -124,12 +140,18 @@ class IncrementalSolver::Impl {
   void DropFactor(int slot);
   void DropVariable(int slot);
 
-  double EvaluateError(int slot) const;
+  double EvaluateError(int slot);
+  void EvaluateErrors(const std::vector<int>& slots);
+  void Prefetch(const std::vector<int>& queue, std::size_t at) const;
+  void SetError(int slot, double error);
+  double TotalError();
   void LinearizeFactor(int slot);
-  bool NeedsRelinearization(const VariableRecord& v) const;
+  void AddUnary(int slot);
+  void SumUnary(int variable);
+  bool NeedsRelinearization(int slot) const;
   void Relinearize(const std::vector<int>& variables);
   void ComputeWeights();
-  void Solve(double threshold, Step* step);
+  void Solve(double publish_threshold, double still_threshold, Step* step);
   void Undo(const Step& step);
   void Shorten(const Step& step, double fraction);
   void RebuildTree();
@@ -142,6 +164,11 @@ class IncrementalSolver::Impl {
   GraphStore graph_;
   BayesTree tree_;
   std::vector<double> errors_;  // Per factor slot, at the estimate; 0 in free slots.
+  std::vector<double> error_sums_;       // Per block of kErrorBlock factor slots.
+  std::vector<char> error_block_stale_;  // Its sum is to be taken again, by TotalError.
+  std::vector<int> stale_error_blocks_;
+  std::vector<int> moved_;               // Moved since they were last looked at for re-linearisation.
+  std::vector<char> has_moved_;          // Per variable slot: is in moved_.
   std::unordered_map<Key, int> slots_;
   std::vector<int> free_variables_;
   std::vector<int> free_factors_;
@@ -156,6 +183,9 @@ class IncrementalSolver::Impl {
   std::vector<double> jacobian_;
   std::vector<double> residual_;
   std::vector<double> x_;
+  std::vector<const Value*> values_;
+  std::vector<int> queue_;
+  Step step_;
   std::vector<int> variable_stamp_;
   std::vector<int> factor_stamp_;
   int stamp_ = 0;
@@ -262,8 +292,10 @@ int IncrementalSolver::Impl::AddVariable(Key key, const Value& value) {
   if (free_variables_.empty()) {
     slot = static_cast<int>(graph_.variables.size());
     graph_.variables.emplace_back();
+    graph_.states.emplace_back();
     groups_.push_back(0);
     variable_stamp_.push_back(0);
+    has_moved_.push_back(0);
   } else {
     slot = free_variables_.back();
     free_variables_.pop_back();
@@ -271,10 +303,12 @@ int IncrementalSolver::Impl::AddVariable(Key key, const Value& value) {
   VariableRecord& v = graph_.variables[slot];
   v = VariableRecord();
   v.key = key;
-  v.dimension = TangentDimension(value);
   v.alive = true;
   v.theta = value;
   v.estimate = value;
+  graph_.states[slot] = VariableState();
+  graph_.states[slot].dimension = TangentDimension(value);
+  graph_.states[slot].last_unit = LastUnit(value);
   slots_[key] = slot;
   return slot;
 }
@@ -285,6 +319,10 @@ int IncrementalSolver::Impl::AddFactor(const FactorPtr& factor) {
     slot = static_cast<int>(graph_.factors.size());
     graph_.factors.emplace_back();
     errors_.push_back(0.0);
+    if (errors_.size() > error_sums_.size() * kErrorBlock) {
+      error_sums_.push_back(0.0);
+      error_block_stale_.push_back(0);
+    }
     factor_stamp_.push_back(0);
   } else {
     slot = free_factors_.back();
@@ -299,16 +337,17 @@ int IncrementalSolver::Impl::AddFactor(const FactorPtr& factor) {
   for (const Key key : factor->keys()) {
     const int v = slots_.at(key);
     record.variables.push_back(v);
-    record.columns += graph_.variables[v].dimension;
+    record.columns += graph_.states[v].dimension;
     graph_.variables[v].factors.push_back(slot);
   }
-  errors_[slot] = EvaluateError(slot);
+  SetError(slot, EvaluateError(slot));
   ++num_factors_;
   return slot;
 }
 
 void IncrementalSolver::Impl::DropFactor(int slot) {
   FactorRecord& record = graph_.factors[slot];
+  const int alone_on = record.variables.size() == 1 ? record.variables.front() : -1;
   for (const int v : record.variables) {
     std::vector<int>& list = graph_.variables[v].factors;
     list.erase(std::find(list.begin(), list.end(), slot));
@@ -316,7 +355,8 @@ void IncrementalSolver::Impl::DropFactor(int slot) {
   record.factor.reset();
   record.variables.clear();
   record.hessian = std::vector<double>();
-  errors_[slot] = 0.0;
+  if (alone_on >= 0) SumUnary(alone_on);
+  SetError(slot, 0.0);
   --num_factors_;
 }
 
@@ -324,67 +364,170 @@ void IncrementalSolver::Impl::DropVariable(int slot) {
   VariableRecord& v = graph_.variables[slot];
   slots_.erase(v.key);
   v.alive = false;
-  v.clique = -1;
+  graph_.states[slot].clique = -1;
 }
 
-double IncrementalSolver::Impl::EvaluateError(int slot) const {
+double IncrementalSolver::Impl::EvaluateError(int slot) {
   const FactorRecord& record = graph_.factors[slot];
-  constexpr std::size_t kInline = 8;
-  const Value* inline_values[kInline];
-  std::vector<const Value*> heap;
-  const Value** values = inline_values;
-  if (record.variables.size() > kInline) {
-    heap.resize(record.variables.size());
-    values = heap.data();
-  }
-  for (std::size_t i = 0; i < record.variables.size(); ++i) {
-    values[i] = &graph_.variables[record.variables[i]].estimate;
-  }
-  const double error = record.factor->Error(values);
+  values_.clear();
+  for (const int v : record.variables) values_.push_back(&graph_.variables[v].estimate);
+  const double error = record.factor->Error(values_.data());
   return std::isfinite(error) ? error : std::numeric_limits<double>::infinity();
 }
 
-void IncrementalSolver::Impl::LinearizeFactor(int slot) {
-  FactorRecord& record = graph_.factors[slot];
-  constexpr std::size_t kInline = 8;
-  const Value* inline_values[kInline];
-  std::vector<const Value*> heap;
-  const Value** values = inline_values;
-  if (record.variables.size() > kInline) {
-    heap.resize(record.variables.size());
-    values = heap.data();
+// The factors lie scattered in memory, so the next ones are fetched while one is evaluated.
+void IncrementalSolver::Impl::EvaluateErrors(const std::vector<int>& slots) {
+  constexpr std::size_t kAhead = 4;
+  constexpr int kLines = 11;  // Of 64 bytes: what a factor between two poses holds.
+  for (std::size_t i = 0; i < slots.size(); ++i) {
+#ifdef __GNUC__
+    if (i + 2 * kAhead < slots.size()) {
+      __builtin_prefetch(graph_.factors[slots[i + 2 * kAhead]].variables.data());
+    }
+    if (i + kAhead < slots.size()) {
+      const FactorRecord& next = graph_.factors[slots[i + kAhead]];
+      const char* object = reinterpret_cast<const char*>(next.factor.get());
+      for (int line = 0; line < kLines; ++line) __builtin_prefetch(object + 64 * line);
+      for (const int v : next.variables) {
+        const char* estimate = reinterpret_cast<const char*>(&graph_.variables[v].estimate);
+        for (int line = 0; line < 3; ++line) __builtin_prefetch(estimate + 64 * line);
+      }
+    }
+#endif
+    SetError(slots[i], EvaluateError(slots[i]));
   }
-  for (std::size_t i = 0; i < record.variables.size(); ++i) {
-    values[i] = &graph_.variables[record.variables[i]].theta;
+}
+
+// Fetches what back-substitution reads of the cliques after the one at `at`.
+void IncrementalSolver::Impl::Prefetch(const std::vector<int>& queue, std::size_t at) const {
+#ifdef __GNUC__
+  constexpr std::size_t kAhead = 2;
+  constexpr std::size_t kDoublesPerLine = 8;
+  constexpr std::size_t kMaxDoubles = 512;  // Beyond this the hardware has seen the stream.
+  if (at + 3 * kAhead < queue.size()) {
+    __builtin_prefetch(&tree_.clique(queue[at + 3 * kAhead]));
   }
-  const int rows = record.factor->dimension();
-  const int columns = record.columns;
-  jacobian_.resize(std::max(jacobian_.size(), static_cast<std::size_t>(rows) * (columns + 1)));
-  double* A = jacobian_.data();
-  double* r = A + static_cast<std::size_t>(rows) * columns;  // The residual is the last column.
-  record.factor->Linearize(values, A, r);
-  for (int i = 0; i < rows; ++i) r[i] = -r[i];
-  const int size = columns + 1;
-  record.hessian.resize(static_cast<std::size_t>(size) * (size + 1) / 2);
-  double* out = record.hessian.data();
+  if (at + 2 * kAhead < queue.size()) {
+    __builtin_prefetch(tree_.clique(queue[at + 2 * kAhead]).variables.data());
+  }
+  if (at + kAhead < queue.size()) {
+    const Clique& clique = tree_.clique(queue[at + kAhead]);
+    const std::size_t size = std::min(clique.conditional.size(), kMaxDoubles);
+    for (std::size_t i = 0; i < size; i += kDoublesPerLine) {
+      __builtin_prefetch(clique.conditional.data() + i);
+    }
+    for (int i = 0; i < clique.num_frontal; ++i) {
+      const char* record = reinterpret_cast<const char*>(&graph_.variables[clique.variables[i]]);
+      for (std::size_t k = 0; k < sizeof(VariableRecord); k += 64) __builtin_prefetch(record + k);
+    }
+  }
+#endif
+}
+
+void IncrementalSolver::Impl::SetError(int slot, double error) {
+  errors_[slot] = error;
+  const std::size_t block = static_cast<std::size_t>(slot) / kErrorBlock;
+  if (!error_block_stale_[block]) {
+    error_block_stale_[block] = 1;
+    stale_error_blocks_.push_back(static_cast<int>(block));
+  }
+}
+
+// The sum of the errors. To be called before a public call returns: Error() only adds the blocks.
+double IncrementalSolver::Impl::TotalError() {
+  for (const int block : stale_error_blocks_) {
+    const std::size_t begin = static_cast<std::size_t>(block) * kErrorBlock;
+    const std::size_t end = std::min(begin + kErrorBlock, errors_.size());
+    double sum = 0.0;
+    for (std::size_t i = begin; i < end; ++i) sum += errors_[i];
+    error_sums_[block] = sum;
+    error_block_stale_[block] = 0;
+  }
+  stale_error_blocks_.clear();
+  return Error();
+}
+
+namespace {
+
+// Packed lower triangle of `M^T M` for M of Rows rows (or `rows`, if Rows is 0) and `size` columns.
+template <int Rows>
+void PackedGram(const double* M, int rows, int size, double* out) {
+  const int n = Rows > 0 ? Rows : rows;
   for (int c = 0; c < size; ++c) {
-    const double* a = A + static_cast<std::size_t>(c) * rows;
+    const double* a = M + static_cast<std::size_t>(c) * n;
     const double* b = a;
-    for (int k = c; k < size; ++k, b += rows) {
+    for (int k = c; k < size; ++k, b += n) {
       double sum = 0.0;
-      for (int i = 0; i < rows; ++i) sum += a[i] * b[i];
+      for (int i = 0; i < n; ++i) sum += a[i] * b[i];
       *out++ = sum;
     }
   }
 }
 
-bool IncrementalSolver::Impl::NeedsRelinearization(const VariableRecord& v) const {
+}  // namespace
+
+// Adds a factor on one variable to the variable's sum.
+void IncrementalSolver::Impl::AddUnary(int slot) {
+  const FactorRecord& record = graph_.factors[slot];
+  std::vector<double>& sum = graph_.variables[record.variables.front()].unary;
+  sum.resize(record.hessian.size(), 0.0);
+  for (std::size_t i = 0; i < sum.size(); ++i) sum[i] += record.hessian[i];
+}
+
+void IncrementalSolver::Impl::SumUnary(int variable) {
+  graph_.variables[variable].unary.clear();
+  for (const int f : graph_.variables[variable].factors) {
+    const FactorRecord& record = graph_.factors[f];
+    if (record.variables.size() == 1 && !record.hessian.empty()) AddUnary(f);
+  }
+}
+
+void IncrementalSolver::Impl::LinearizeFactor(int slot) {
+  FactorRecord& record = graph_.factors[slot];
+  const bool first_time = record.hessian.empty();
+  values_.clear();
+  for (const int v : record.variables) values_.push_back(&graph_.variables[v].theta);
+  const int rows = record.factor->dimension();
+  const int columns = record.columns;
+  jacobian_.resize(std::max(jacobian_.size(), static_cast<std::size_t>(rows) * (columns + 1)));
+  double* A = jacobian_.data();
+  double* r = A + static_cast<std::size_t>(rows) * columns;  // The residual is the last column.
+  record.factor->Linearize(values_.data(), A, r);
+  for (int i = 0; i < rows; ++i) r[i] = -r[i];
+  const int size = columns + 1;
+  record.hessian.resize(static_cast<std::size_t>(size) * (size + 1) / 2);
+  double* out = record.hessian.data();
+  switch (rows) {
+    case 1:
+      PackedGram<1>(A, rows, size, out);
+      break;
+    case 2:
+      PackedGram<2>(A, rows, size, out);
+      break;
+    case 3:
+      PackedGram<3>(A, rows, size, out);
+      break;
+    case 5:
+      PackedGram<5>(A, rows, size, out);
+      break;
+    case 6:
+      PackedGram<6>(A, rows, size, out);
+      break;
+    default:
+      PackedGram<0>(A, rows, size, out);
+  }
+  // Later ones are part of a new sum over all, in Relinearize.
+  if (first_time && record.variables.size() == 1) AddUnary(slot);
+}
+
+bool IncrementalSolver::Impl::NeedsRelinearization(int slot) const {
+  const VariableState& v = graph_.states[slot];
   const auto norm = [&v](int start, int count) {
     double sum = 0.0;
     for (int i = start; i < start + count; ++i) sum += v.delta[i] * v.delta[i];
     return std::sqrt(sum);
   };
-  switch (v.theta.index()) {
+  switch (graph_.variables[slot].theta.index()) {
     case 0:
       return norm(0, 3) > config_.relinearize_rotation_rad ||
              norm(3, 3) > config_.relinearize_translation_m;
@@ -402,8 +545,10 @@ void IncrementalSolver::Impl::Relinearize(const std::vector<int>& variables) {
   for (const int slot : variables) {
     VariableRecord& v = graph_.variables[slot];
     v.theta = v.estimate;
-    std::fill(std::begin(v.delta), std::end(v.delta), 0.0);
-    std::fill(std::begin(v.published), std::end(v.published), 0.0);
+    VariableState& state = graph_.states[slot];
+    state.last_unit = LastUnit(v.theta);
+    std::fill(std::begin(state.delta), std::end(state.delta), 0.0);
+    std::fill(std::begin(state.published), std::end(state.published), 0.0);
   }
   for (const int slot : variables) {
     for (const int f : graph_.variables[slot].factors) {
@@ -412,6 +557,7 @@ void IncrementalSolver::Impl::Relinearize(const std::vector<int>& variables) {
       LinearizeFactor(f);
     }
   }
+  for (const int slot : variables) SumUnary(slot);
 }
 
 void IncrementalSolver::Impl::ComputeWeights() {
@@ -421,7 +567,7 @@ void IncrementalSolver::Impl::ComputeWeights() {
     int column = 0;
     const int size = record.columns + 1;
     for (const int v : record.variables) {
-      for (int k = 0; k < graph_.variables[v].dimension; ++k, ++column) {
+      for (int k = 0; k < graph_.states[v].dimension; ++k, ++column) {
         weights_[static_cast<std::size_t>(v) * kMaxTangentDimension + k] +=
             record.hessian[internal::PackedIndex(column, column, size)];
       }
@@ -433,16 +579,29 @@ void IncrementalSolver::Impl::ComputeWeights() {
 // Steps
 // -------------------------------------------------------------------------------------------------
 
+void IncrementalSolver::Impl::Step::Clear() {
+  variables.clear();
+  delta.clear();
+  moved.clear();
+  published.clear();
+  estimate.clear();
+  factors.clear();
+  errors.clear();
+  cliques.clear();
+}
+
 // Back-substitution from the roots through every clique that was factorised or whose separator has
-// moved by more than the threshold; then the estimates and the errors of what has moved.
-void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
-  *step = Step();
+// moved by more than the threshold (Kaess et al. 2012, "wildfire"); then the estimates and the errors of what has moved.
+void IncrementalSolver::Impl::Solve(double publish_threshold, double still_threshold, Step* step) {
+  step->Clear();
   ++stamp_;
   std::vector<VariableRecord>& variables = graph_.variables;
-  std::vector<int> stack(tree_.roots().rbegin(), tree_.roots().rend());
-  while (!stack.empty()) {
-    const int c = stack.back();
-    stack.pop_back();
+  // Breadth first, so that what comes next is known and can be fetched.
+  std::vector<int>& queue = queue_;
+  queue = tree_.roots();
+  for (std::size_t next = 0; next < queue.size(); ++next) {
+    const int c = queue[next];
+    Prefetch(queue, next);
     Clique& clique = tree_.clique(c);
     bool needed = clique.unsolved;
     for (std::size_t i = clique.num_frontal; !needed && i < clique.variables.size(); ++i) {
@@ -455,21 +614,27 @@ void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
     const double* x = x_.data();
     for (int i = 0; i < clique.num_frontal; ++i) {
       const int slot = clique.variables[i];
-      VariableRecord& v = variables[slot];
+      VariableState& v = graph_.states[slot];
       bool moved = false;
       bool publish = false;
       for (int k = 0; k < v.dimension; ++k) {
-        moved = moved || std::abs(x[k] - v.delta[k]) > kStillPart * threshold;
-        publish = publish || std::abs(x[k] - v.published[k]) > threshold;
+        const double unit = k + 1 == v.dimension ? v.last_unit : 1.0;
+        moved = moved || std::abs(x[k] - v.delta[k]) > still_threshold * unit;
+        publish = publish || std::abs(x[k] - v.published[k]) > publish_threshold * unit;
       }
       if (moved) {
         step->variables.push_back(slot);
         step->delta.insert(step->delta.end(), std::begin(v.delta), std::end(v.delta));
         step->published.insert(step->published.end(), std::begin(v.published), std::end(v.published));
-        step->estimate.push_back(v.estimate);
+        VariableRecord& record = variables[slot];
+        step->estimate.push_back(record.estimate);
         std::copy(x, x + v.dimension, v.delta);
         step->moved.insert(step->moved.end(), std::begin(v.delta), std::end(v.delta));
-        v.estimate = Retract(v.theta, v.delta);
+        record.estimate = Retract(record.theta, v.delta);
+        if (!has_moved_[slot]) {
+          has_moved_[slot] = 1;
+          moved_.push_back(slot);
+        }
         if (publish) {
           std::copy(x, x + v.dimension, v.published);
           variable_stamp_[slot] = stamp_;
@@ -479,7 +644,7 @@ void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
     }
     clique.unsolved = false;
     step->cliques.push_back(c);
-    stack.insert(stack.end(), clique.children.rbegin(), clique.children.rend());
+    queue.insert(queue.end(), clique.children.begin(), clique.children.end());
   }
   for (const int slot : step->variables) {
     for (const int f : variables[slot].factors) {
@@ -487,33 +652,34 @@ void IncrementalSolver::Impl::Solve(double threshold, Step* step) {
       factor_stamp_[f] = stamp_;
       step->factors.push_back(f);
       step->errors.push_back(errors_[f]);
-      errors_[f] = EvaluateError(f);
     }
   }
+  EvaluateErrors(step->factors);
 }
 
 void IncrementalSolver::Impl::Undo(const Step& step) {
   for (std::size_t i = 0; i < step.variables.size(); ++i) {
-    VariableRecord& v = graph_.variables[step.variables[i]];
+    VariableState& v = graph_.states[step.variables[i]];
     const auto offset = static_cast<long>(i) * kMaxTangentDimension;
     std::copy_n(step.delta.begin() + offset, kMaxTangentDimension, v.delta);
     std::copy_n(step.published.begin() + offset, kMaxTangentDimension, v.published);
-    v.estimate = step.estimate[i];
+    graph_.variables[step.variables[i]].estimate = step.estimate[i];
   }
-  for (std::size_t i = 0; i < step.factors.size(); ++i) errors_[step.factors[i]] = step.errors[i];
+  for (std::size_t i = 0; i < step.factors.size(); ++i) SetError(step.factors[i], step.errors[i]);
   for (const int c : step.cliques) tree_.clique(c).unsolved = true;
 }
 
 // Takes only a part of an undone step. Its cliques stay unsolved: the next step starts from here.
 void IncrementalSolver::Impl::Shorten(const Step& step, double fraction) {
   for (std::size_t i = 0; i < step.variables.size(); ++i) {
-    VariableRecord& v = graph_.variables[step.variables[i]];
+    VariableState& v = graph_.states[step.variables[i]];
+    VariableRecord& record = graph_.variables[step.variables[i]];
     const double* before = step.delta.data() + i * kMaxTangentDimension;
     const double* after = step.moved.data() + i * kMaxTangentDimension;
     for (int k = 0; k < v.dimension; ++k) v.delta[k] = before[k] + fraction * (after[k] - before[k]);
-    v.estimate = Retract(v.theta, v.delta);
+    record.estimate = Retract(record.theta, v.delta);
   }
-  for (const int f : step.factors) errors_[f] = EvaluateError(f);
+  EvaluateErrors(step.factors);
 }
 
 // A new tree over the whole graph at the present linearisation points, without damping.
@@ -526,7 +692,8 @@ void IncrementalSolver::Impl::RebuildTree() {
     if (graph_.variables[v].alive) variables.push_back(static_cast<int>(v));
   }
   for (std::size_t f = 0; f < graph_.factors.size(); ++f) {
-    if (graph_.factors[f].factor) factors.push_back(static_cast<int>(f));
+    const FactorRecord& record = graph_.factors[f];
+    if (record.factor && record.variables.size() > 1) factors.push_back(static_cast<int>(f));
   }
   tree_.Restructure(variables, factors, groups_, epoch_);
 }
@@ -621,7 +788,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
     const int slot = AddFactor(factor);
     new_factor_slots.push_back(slot);
     for (const int v : graph_.factors[slot].variables) {
-      if (graph_.variables[v].clique >= 0) structural.push_back(v);
+      if (graph_.states[v].clique >= 0) structural.push_back(v);
     }
   }
   // A variable that lost its last factor goes with it.
@@ -633,21 +800,28 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       DropVariable(v);
     }
   }
-  result.error_before = Error();
+  result.error_before = TotalError();
 
   try {
     // What moves its linearisation point.
     std::vector<int> relinearized;
     if (epoch_ % config_.relinearize_skip == 0) {
-      for (std::size_t v = 0; v < graph_.variables.size(); ++v) {
-        if (graph_.variables[v].alive && NeedsRelinearization(graph_.variables[v])) {
-          relinearized.push_back(static_cast<int>(v));
+      std::sort(moved_.begin(), moved_.end());
+      for (const int v : moved_) {
+        has_moved_[v] = 0;
+        if (graph_.variables[v].alive && NeedsRelinearization(v)) {
+          relinearized.push_back(v);
         }
       }
+      moved_.clear();
       Relinearize(relinearized);
       result.variables_relinearized = static_cast<int>(relinearized.size());
     }
-    for (const int f : new_factor_slots) LinearizeFactor(f);
+    std::vector<int> joining;  // New factors that join variables, and so shape the tree.
+    for (const int f : new_factor_slots) {
+      LinearizeFactor(f);
+      if (graph_.factors[f].variables.size() > 1) joining.push_back(f);
+    }
 
     // What is eliminated again: in a new order around the new factors, in the old one elsewhere.
     for (const int v : structural) {
@@ -662,18 +836,12 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       last_reorder_ = epoch_;
     }
     for (const int slot : relinearized) {
-      for (const int f : graph_.variables[slot].factors) {
-        for (const int v : graph_.factors[f].variables) {
-          const int c = graph_.variables[v].clique;
-          if (c < 0) continue;
-          const std::vector<int>& list = tree_.clique(c).factors;
-          if (std::find(list.begin(), list.end(), f) != list.end()) tree_.MarkDirty(c);
-        }
-      }
+      tree_.MarkDirty(graph_.states[slot].clique);
+      for (const int f : graph_.variables[slot].factors) tree_.MarkDirty(graph_.factors[f].clique);
     }
     for (const int v : damped_variables_) {
-      if (graph_.variables[v].alive && graph_.variables[v].clique >= 0) {
-        tree_.MarkDirty(graph_.variables[v].clique);
+      if (graph_.variables[v].alive && graph_.states[v].clique >= 0) {
+        tree_.MarkDirty(graph_.states[v].clique);
       }
     }
     damped_variables_.clear();
@@ -682,12 +850,12 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       for (const int v : graph_.factors[f].variables) groups_[v] = 1;
     }
     for (const Key key : options.constrained_last) groups_[SlotOf(key)] = 1;
-    tree_.Restructure(new_variable_slots, new_factor_slots, groups_, epoch_);
+    tree_.Restructure(new_variable_slots, joining, groups_, epoch_);
 
     // Steps, with damping once one was refused.
     std::vector<int> touched;
     bool damped = lambda_ > 0.0;
-    Step step;
+    Step& step = step_;
     for (result.iterations = 1;; ++result.iterations) {
       if (lambda_ > 0.0) ComputeWeights();
       const int failed = tree_.Factorize({lambda_, &weights_});
@@ -696,8 +864,14 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
         touched = tree_.factorized();
         result.variables_reeliminated = tree_.CountFrontal(touched);
       }
-      Solve(config_.wildfire_threshold, &step);
-      const double error = Error();
+      Solve(config_.wildfire_threshold, config_.still_threshold, &step);
+      double error = TotalError();
+      if (!Lowers(error, result.error_before) && config_.still_threshold > 0.0) {
+        // What was left out may be what the step lacks.
+        Undo(step);
+        Solve(kFinePart * config_.wildfire_threshold, kFinePart * config_.still_threshold, &step);
+        error = TotalError();
+      }
       if (Lowers(error, result.error_before)) {
         result.damping = lambda_;
         lambda_ *= config_.lambda_down;
@@ -712,7 +886,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
         bool accepted = false;
         for (; fraction > 0.1 && !accepted; fraction *= 0.5) {
           Shorten(step, fraction);
-          accepted = Error() <= result.error_before;
+          accepted = TotalError() <= result.error_before;
           if (!accepted) Undo(step);
         }
         if (accepted || error <= (1.0 + kNegligibleRise) * result.error_before) break;
@@ -722,9 +896,9 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       if (result.steps_refused == 1) {
         std::vector<int> stale;
         for (const int v : step.variables) {
-          const VariableRecord& record = graph_.variables[v];
-          for (int k = 0; k < record.dimension; ++k) {
-            if (record.delta[k] != 0.0) {
+          const VariableState& state = graph_.states[v];
+          for (int k = 0; k < state.dimension; ++k) {
+            if (state.delta[k] != 0.0) {
               stale.push_back(v);
               break;
             }
@@ -733,6 +907,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
         Relinearize(stale);
         result.variables_relinearized += static_cast<int>(stale.size());
         for (const int slot : stale) {
+          tree_.MarkDirty(graph_.states[slot].clique);
           for (const int f : graph_.variables[slot].factors) {
             tree_.MarkDirty(graph_.factors[f].clique);
           }
@@ -759,10 +934,12 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       const int slot = removed_slots[i];
       graph_.factors[slot] = removed_records[i];
       for (const int v : removed_records[i].variables) graph_.variables[v].factors.push_back(slot);
-      errors_[slot] = EvaluateError(slot);
+      SetError(slot, EvaluateError(slot));
       LinearizeFactor(slot);
+      if (removed_records[i].variables.size() == 1) SumUnary(removed_records[i].variables.front());
       ++num_factors_;
     }
+    TotalError();
     RestoreTree();
     throw;
   }
@@ -775,7 +952,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
   if (options.converge) {
     result = Iterate(config_.relative_tolerance, config_.batch_max_iterations, std::move(result));
   }
-  result.error_after = Error();
+  result.error_after = TotalError();
   result.seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return result;
@@ -788,8 +965,8 @@ UpdateResult IncrementalSolver::Impl::Iterate(double tolerance, int max_iteratio
     if (graph_.variables[v].alive) all.push_back(static_cast<int>(v));
   }
   double lambda = 0.0;
-  double error = Error();
-  Step step;
+  double error = TotalError();
+  Step& step = step_;
   result.converged = false;
   Relinearize(all);
   for (int i = 0; i < max_iterations && !result.converged; ++i) {
@@ -800,8 +977,8 @@ UpdateResult IncrementalSolver::Impl::Iterate(double tolerance, int max_iteratio
     if (failed >= 0) ThrowUnderconstrained(failed);
     result.variables_relinearized += static_cast<int>(all.size());
     result.variables_reeliminated += static_cast<int>(all.size());
-    Solve(0.0, &step);
-    const double next = Error();
+    Solve(0.0, 0.0, &step);
+    const double next = TotalError();
     if (Lowers(next, error)) {
       result.converged = error - next <= tolerance * error;
       result.damping = lambda;
@@ -840,16 +1017,17 @@ UpdateResult IncrementalSolver::Impl::OptimizeBatch(const FactorList& new_factor
     result.new_factor_ids.push_back(
         MakeFactorId(graph_.factors[factor_slots.back()].generation, factor_slots.back()));
   }
-  result.error_before = Error();
+  result.error_before = TotalError();
   RebuildTree();
   try {
     result = Iterate(config_.relative_tolerance, config_.batch_max_iterations, std::move(result));
   } catch (...) {
     TakeBack(factor_slots, variable_slots);
+    TotalError();
     RestoreTree();
     throw;
   }
-  result.error_after = Error();
+  result.error_after = TotalError();
   result.seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return result;
@@ -895,12 +1073,12 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
   int eliminated = 0;
   for (const int v : removed) {
     offset[v] = eliminated;
-    eliminated += graph_.variables[v].dimension;
+    eliminated += graph_.states[v].dimension;
   }
   int size = eliminated;
   for (const int v : neighbours) {
     offset[v] = size;
-    size += graph_.variables[v].dimension;
+    size += graph_.states[v].dimension;
   }
   Eigen::MatrixXd H = Eigen::MatrixXd::Zero(size, size);
   Eigen::VectorXd g = Eigen::VectorXd::Zero(size);
@@ -913,11 +1091,11 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
     record.factor->Linearize(values.data(), J.data(), r.data());
     int ca = 0;
     for (const int a : record.variables) {
-      const int da = graph_.variables[a].dimension;
+      const int da = graph_.states[a].dimension;
       g.segment(offset[a], da) -= J.middleCols(ca, da).transpose() * r;
       int cb = 0;
       for (const int b : record.variables) {
-        const int db = graph_.variables[b].dimension;
+        const int db = graph_.states[b].dimension;
         H.block(offset[a], offset[b], da, db) +=
             J.middleCols(ca, da).transpose() * J.middleCols(cb, db);
         cb += db;
@@ -940,7 +1118,15 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
     const Eigen::MatrixXd X = ldlt.solve(H.topRightCorner(eliminated, kept));
     Eigen::MatrixXd H_kept = H.bottomRightCorner(kept, kept) - H.bottomLeftCorner(kept, eliminated) * X;
     H_kept = (0.5 * (H_kept + H_kept.transpose())).eval();
-    const Eigen::VectorXd g_kept = g.tail(kept) - X.transpose() * g.head(eliminated);
+    Eigen::VectorXd g_kept = g.tail(kept) - X.transpose() * g.head(eliminated);
+    // Where the removed variables took all information with them (a pose that only hung on its
+    // neighbour), what is left of it is rounding.
+    for (Eigen::Index i = 0; i < kept; ++i) {
+      if (H_kept(i, i) > kNoInformation * H(eliminated + i, eliminated + i)) continue;
+      H_kept.row(i).setZero();
+      H_kept.col(i).setZero();
+      g_kept[i] = 0.0;
+    }
     std::vector<Key> names;
     std::vector<Value> origins;
     for (const int v : neighbours) {
@@ -966,7 +1152,7 @@ Eigen::MatrixXd IncrementalSolver::Impl::JointMarginalCovariance(const std::vect
   int row = 0;
   for (const int slot : selected) {
     const VariableRecord& v = graph_.variables[slot];
-    const int d = v.dimension;
+    const int d = graph_.states[slot].dimension;
     double buffer[kMaxTangentDimension * kMaxTangentDimension];
     LocalCoordinatesJacobian(v.theta, v.estimate, buffer);
     const Eigen::MatrixXd J = Eigen::Map<const Eigen::MatrixXd>(buffer, d, d).inverse();

@@ -1,8 +1,9 @@
 #include "dendro_slam/factor_graph/linear_factor.h"
 
+#include <cmath>
+#include <cstddef>
 #include <stdexcept>
-
-#include <Eigen/Eigenvalues>
+#include <utility>
 
 namespace dendro {
 
@@ -37,21 +38,47 @@ LinearFactor::LinearFactor(const std::vector<Key>& keys,
   if (H.rows() != H.cols() || g.size() != H.rows() || !H.allFinite() || !g.allFinite()) {
     throw std::invalid_argument("linear factor: the quadratic must be square, matching and finite");
   }
-  // H = U S U^T; A = S^1/2 U^T and A^T r0 = -g. Scaled to a unit diagonal first, so that radians,
-  // metres and 1/metres are judged alike.
-  const Eigen::VectorXd scale = H.diagonal().cwiseMax(1e-300).cwiseSqrt();
-  const Eigen::MatrixXd scaled = scale.cwiseInverse().asDiagonal() * H * scale.cwiseInverse().asDiagonal();
-  const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(scaled);
-  constexpr double kRelativeRank = 1e-11;
-  const double threshold = kRelativeRank * std::max(eigen.eigenvalues().maxCoeff(), 0.0);
+  // Cholesky factorisation with diagonal pivoting until nothing but rounding is left: P H P^T = L L^T
+  // with L of as many columns as H has ranks; A = L^T P and A^T r0 = -g. (Eigen's LDLT does not update
+  // the diagonal before it picks the pivot, so it does not tell the rank.) Scaled to a unit diagonal
+  // first, so that radians, metres and 1/metres are judged alike.
+  // A coordinate whose diagonal is not positive has no information: its row is dropped.
+  Eigen::VectorXd scale(H.rows()), inverse(H.rows());
+  for (Eigen::Index i = 0; i < H.rows(); ++i) {
+    scale[i] = H(i, i) > 0.0 ? std::sqrt(H(i, i)) : 0.0;
+    inverse[i] = scale[i] > 0.0 ? 1.0 / scale[i] : 0.0;
+  }
+  constexpr double kRank = 1e-11;
   const Eigen::Index n = H.rows();
-  Eigen::Index first = 0;
-  while (first < n && !(eigen.eigenvalues()[first] > threshold)) ++first;
-  const Eigen::Index rank = n - first;
-  const Eigen::VectorXd root = eigen.eigenvalues().tail(rank).cwiseSqrt();
-  A_ = root.asDiagonal() * eigen.eigenvectors().rightCols(rank).transpose() * scale.asDiagonal();
-  r0_ = -(root.cwiseInverse().asDiagonal() *
-          (eigen.eigenvectors().rightCols(rank).transpose() * g.cwiseQuotient(scale)));
+  Eigen::MatrixXd rest = inverse.asDiagonal() * H * inverse.asDiagonal();
+  Eigen::MatrixXd L = Eigen::MatrixXd::Zero(n, n);
+  Eigen::VectorXd y = -g.cwiseProduct(inverse);
+  std::vector<Eigen::Index> order(static_cast<std::size_t>(n));
+  for (Eigen::Index i = 0; i < n; ++i) order[static_cast<std::size_t>(i)] = i;
+  Eigen::Index rank = 0;
+  for (; rank < n; ++rank) {
+    Eigen::Index pivot = 0;
+    if (!(rest.diagonal().tail(n - rank).maxCoeff(&pivot) > kRank)) break;
+    pivot += rank;
+    std::swap(order[static_cast<std::size_t>(rank)], order[static_cast<std::size_t>(pivot)]);
+    std::swap(y[rank], y[pivot]);
+    L.row(rank).swap(L.row(pivot));
+    rest.row(rank).swap(rest.row(pivot));
+    rest.col(rank).swap(rest.col(pivot));
+    const Eigen::Index below = n - rank - 1;
+    L(rank, rank) = std::sqrt(rest(rank, rank));
+    L.col(rank).tail(below) = rest.col(rank).tail(below) / L(rank, rank);
+    y[rank] /= L(rank, rank);
+    y.tail(below) -= y[rank] * L.col(rank).tail(below);
+    rest.bottomRightCorner(below, below).noalias() -=
+        L.col(rank).tail(below) * L.col(rank).tail(below).transpose();
+  }
+  A_.resize(rank, n);
+  for (Eigen::Index j = 0; j < n; ++j) {
+    const Eigen::Index column = order[static_cast<std::size_t>(j)];
+    A_.col(column) = scale[column] * L.row(j).head(rank).transpose();
+  }
+  r0_ = y.head(rank);
 }
 
 std::shared_ptr<const LinearFactor> LinearFactor::FromSquareRoot(const std::vector<Key>& keys,

@@ -45,8 +45,8 @@ template <int N>
 void WhitenColumns(const NoiseModel::Matrix& sqrt_information, double scale, double* m, int columns) {
   using Square = Eigen::Matrix<double, N, N>;
   using Column = Eigen::Matrix<double, N, 1>;
-  Square W = sqrt_information;
-  if (scale != 1.0) W *= scale;
+  const Eigen::Map<const Square> W(sqrt_information.data());
+  if (scale != 1.0) Eigen::Map<Eigen::Matrix<double, N, Eigen::Dynamic>>(m, N, columns) *= scale;
   for (int c = 0; c < columns; ++c) {
     Eigen::Map<Column> column(m + c * N);
     const Column whitened = W * column;

@@ -4,6 +4,8 @@
 
 #include "dendro_slam/geometry/so3.h"
 
+#include "inverse_jacobian.h"
+
 namespace dendro {
 
 namespace {
@@ -29,8 +31,10 @@ Eigen::Matrix3d LeftQ(const Eigen::Vector3d& omega, const Eigen::Vector3d& rho) 
     c2 = (theta2 + 2.0 * c - 2.0) / (2.0 * theta4);
     c3 = (2.0 * theta - 3.0 * s + theta * c) / (2.0 * theta4 * theta);
   }
-  return 0.5 * P + c1 * (W * P + P * W + W * P * W) + c2 * (W * W * P + P * W * W - 3.0 * W * P * W) +
-         c3 * (W * P * W * W + W * W * P * W);
+  const Eigen::Matrix3d WP = W * P;
+  const Eigen::Matrix3d PW = P * W;
+  const Eigen::Matrix3d WPW = WP * W;
+  return 0.5 * P + c1 * (WP + PW + WPW) + c2 * (W * WP + PW * W - 3.0 * WPW) + c3 * (WPW * W + W * WPW);
 }
 
 }  // namespace
@@ -45,7 +49,12 @@ Eigen::Isometry3d ExpSe3(const Vector6d& xi) {
 Vector6d LogSe3(const Eigen::Isometry3d& T) {
   Vector6d xi;
   xi.head<3>() = LogSo3(T.linear());
-  xi.tail<3>() = RightJacobianInverseSo3(-xi.head<3>()) * T.translation();
+  // Jl(omega)^-1 t, by cross products.
+  const Eigen::Vector3d omega = xi.head<3>();
+  const Eigen::Vector3d t = T.translation();
+  const Eigen::Vector3d u = omega.cross(t);
+  xi.tail<3>() =
+      t - 0.5 * u + internal::InverseJacobianCoefficient(omega.squaredNorm()) * omega.cross(u);
   return xi;
 }
 

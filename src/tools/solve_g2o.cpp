@@ -157,6 +157,8 @@ int main(int argc, char** argv) {
   bool no_chordal = false;
   std::string trace_file;
   dendro::SolverConfig config;
+  config.relinearize_skip = 10;
+  double wildfire = 1e-3;
   CLI::App app{"Solves an SE(3) pose graph in the g2o format. Reports 1/2 chi2 as GTSAM counts it: SE(3) logarithm "
                "residuals, the file's information matrices, and a prior on the first pose with sigma 1e-4."};
   app.add_option("file", file, "Graph with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines")->required();
@@ -165,8 +167,12 @@ int main(int argc, char** argv) {
   app.add_option("--out", out_file, "Write the solved graph to this g2o file");
   app.add_option("--trace", trace_file, "Write the processor seconds of every update to this text file");
   app.add_flag("--no-chordal", no_chordal, "Batch: start from the poses of the file, not from chordal initialisation");
-  app.add_option("--relinearize-skip", config.relinearize_skip, "Re-linearise in every n-th update");
+  app.add_option("--relinearize-skip", config.relinearize_skip, "Re-linearise in every n-th update")
+      ->capture_default_str();
+  app.add_option("--wildfire", wildfire, "Incremental: smaller changes of a tangent coordinate (rad, m) wait")
+      ->capture_default_str();
   CLI11_PARSE(app, argc, argv);
+  config.wildfire_threshold = config.still_threshold = wildfire;
 
   try {
     std::ifstream in(file);

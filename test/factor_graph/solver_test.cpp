@@ -1,6 +1,4 @@
 #include <cmath>
-#include <filesystem>
-#include <fstream>
 #include <limits>
 #include <random>
 #include <sstream>
@@ -396,71 +394,6 @@ TEST(G2o, ReadsWritesAndNamesTheLine) {
   } catch (const std::runtime_error& e) {
     EXPECT_THAT(e.what(), testing::HasSubstr("line 2"));
   }
-}
-
-class PublicGraph : public testing::TestWithParam<std::pair<const char*, double>> {
- protected:
-  void SetUp() override {
-    const std::string path = std::string(DENDRO_SHARED_DATA) + "/posegraph/" + GetParam().first;
-    if (!std::filesystem::exists(path)) GTEST_SKIP() << path << " is missing";
-    std::ifstream in(path);
-    graph_ = ReadG2o(in);
-    factors_ = PoseGraphFactors(graph_);
-    prior_ = std::make_shared<PosePrior>(PoseGraphKey(graph_.poses.begin()->first),
-                                         graph_.poses.begin()->second, NoiseModel::Isotropic(6, 1e-4));
-  }
-
-  PoseGraph graph_;
-  FactorList factors_;
-  FactorPtr prior_;
-};
-
-TEST_P(PublicGraph, BatchFromChordalReachesTheBestKnown) {
-  Values values;
-  for (const auto& [id, pose] : ChordalInitialization(graph_)) values.Insert(PoseGraphKey(id), pose);
-  FactorList all = factors_;
-  all.push_back(prior_);
-  IncrementalSolver solver;
-  const UpdateResult result = solver.OptimizeBatch(all, values);
-  EXPECT_TRUE(result.converged);
-  EXPECT_NEAR(result.error_after, GetParam().second, 1e-5 * GetParam().second);
-}
-
-INSTANTIATE_TEST_SUITE_P(Shared, PublicGraph,
-                         testing::Values(std::make_pair("smallGrid3D.g2o", 517.925),
-                                         std::make_pair("sphere2500.g2o", 675.701),
-                                         std::make_pair("parking-garage.g2o", 0.634192)));
-
-TEST(PublicGraphIncremental, SmallGridEqualsBatch) {
-  const std::string path = std::string(DENDRO_SHARED_DATA) + "/posegraph/smallGrid3D.g2o";
-  if (!std::filesystem::exists(path)) GTEST_SKIP() << path << " is missing";
-  std::ifstream in(path);
-  const PoseGraph graph = ReadG2o(in);
-  const FactorList all = PoseGraphFactors(graph);
-  IncrementalSolver solver;
-  for (const auto& [id, file_pose] : graph.poses) {
-    FactorList factors;
-    Values values;
-    Eigen::Isometry3d pose = file_pose;
-    for (std::size_t i = 0; i < all.size(); ++i) {
-      const PoseGraphEdge& edge = graph.edges[i];
-      if (std::max(edge.from, edge.to) != id) continue;
-      factors.push_back(all[i]);
-      if (edge.to == id && edge.from == id - 1) {
-        pose = solver.Estimate<Eigen::Isometry3d>(PoseGraphKey(id - 1)) * edge.T_from_to;
-      }
-    }
-    if (factors.empty() || id == 0) {
-      factors.push_back(std::make_shared<PosePrior>(PoseGraphKey(id), pose, NoiseModel::Isotropic(6, 1e-4)));
-    }
-    values.Insert(PoseGraphKey(id), pose);
-    const UpdateResult result = solver.Update(factors, values);
-    EXPECT_LE(result.error_after, result.error_before * (1 + 1e-12));
-  }
-  EXPECT_NEAR(solver.Error(), 517.925, 0.005 * 517.925);
-  UpdateOptions converge;
-  converge.converge = true;
-  EXPECT_NEAR(solver.Update({}, {}, converge).error_after, 517.92533, 1e-6 * 517.925);
 }
 
 }  // namespace

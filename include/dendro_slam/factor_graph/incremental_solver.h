@@ -17,7 +17,8 @@ struct SolverConfig {
   double relinearize_axis_rad = 0.05;        ///< A cylinder is re-linearised beyond this turn of its axis [rad]. >= 0.
   double relinearize_offset_m = 0.1;         ///< A cylinder or point is re-linearised beyond this displacement [m]. >= 0.
   int relinearize_skip = 1;                  ///< Look for variables to re-linearise every n-th update. >= 1.
-  double wildfire_threshold = 1e-3;          ///< Back-substitution stops where no tangent coordinate changed by more. >= 0.
+  double wildfire_threshold = 1e-3;          ///< Back-substitution stops where nothing changed by more [rad, m; a curvature by its radius]. >= 0.
+  double still_threshold = 2e-5;             ///< A variable stays where it is when it would change by less [rad, m; likewise]. >= 0.
   int max_iterations = 5;                    ///< Levenberg-Marquardt steps of one update, refused ones included. >= 1.
   double lambda_initial = 1e-4;              ///< Damping after the first refused step, relative to the Hessian's diagonal. > 0.
   double lambda_up = 10.0;                   ///< Factor of the damping after a refused step. > 1.
@@ -39,6 +40,7 @@ struct SolverConfig {
     v("relinearize_offset_m", relinearize_offset_m);
     v("relinearize_skip", relinearize_skip);
     v("wildfire_threshold", wildfire_threshold);
+    v("still_threshold", still_threshold);
     v("max_iterations", max_iterations);
     v("lambda_initial", lambda_initial);
     v("lambda_up", lambda_up);
@@ -112,7 +114,21 @@ class IncrementalSolver {
 
   /// Replaces variables by the linear factor that they leave on their neighbours (Schur complement
   /// at the present estimate) and removes them with all their factors, so that a long run stays
-  /// bounded. @throws UnknownVariableError.
+  /// bounded. What is left has the estimate and the marginal covariances it had (exactly where the
+  /// removed factors were linear; otherwise to the error of linearising them at the estimate).
+  ///
+  /// The linear factor keeps its linearisation point for good: it is a quadratic in the tangent space
+  /// of each neighbour there, and takes part in later steps, re-linearisation and damping as any other
+  /// factor. A later call that removes one of its variables absorbs it, so a window that slides by one
+  /// pose at a time has one such factor on the poses and landmarks at its edge. It joins all neighbours,
+  /// so remove what has few of them: a pose between two others and the landmarks seen from it.
+  /// Dense, cubic in the tangent dimensions of `keys` and their neighbours together: a few poses a
+  /// call. The constant of the quadratic is dropped, so Error() falls by what the removed factors
+  /// contribute at the optimum.
+  /// @param keys  Duplicates count once.
+  /// @throws UnknownVariableError for a key that is not in the graph; UnderconstrainedError, naming a
+  ///         variable, if the factors leave a direction of the removed variables free. The graph is
+  ///         then as before.
   /// @return  Id of the linear factor; 0 if the variables had no neighbours.
   FactorId Marginalize(const std::vector<Key>& keys);
 
