@@ -237,6 +237,24 @@ Json CylinderJson(const MapCylinder& c) {
           {"status", ToString(c.status)}};
 }
 
+Json GeoreferenceJson(const Georeference& g) {
+  const auto finite = [&](double v) { return Finite(v, "a number of the georeference", 0); };
+  const auto optional = [&](const std::optional<double>& v) { return v ? Json(finite(*v)) : Json(); };
+  return {{"latitude_deg", finite(g.origin.latitude_deg)},
+          {"longitude_deg", finite(g.origin.longitude_deg)},
+          {"altitude_m", optional(g.origin.altitude_m)},
+          {"heading_deg", optional(g.heading_deg)},
+          {"heading_sigma_deg", finite(g.heading_sigma_deg)},
+          {"horizontal_sigma_m", finite(g.horizontal_sigma_m)},
+          {"vertical_sigma_m", finite(g.vertical_sigma_m)},
+          {"pivot", {finite(g.pivot.x()), finite(g.pivot.y())}},
+          {"num_fixes", g.num_fixes},
+          {"num_outliers", g.num_outliers},
+          {"residual_m", finite(g.residual_m)},
+          {"span_m", finite(g.span_m)},
+          {"note", g.note}};
+}
+
 Json BranchJson(const MapBranch& b) {
   const auto finite = [&](double v) { return Finite(v, "a number of branch", b.id); };
   return {{"id", b.id},
@@ -581,6 +599,26 @@ MapTree ReadTree(const Reader& j) {
   return t;
 }
 
+Georeference ReadGeoreference(const Reader& j) {
+  Georeference g;
+  g.origin.latitude_deg = j["latitude_deg"].Double();
+  g.origin.longitude_deg = j["longitude_deg"].Double();
+  if (!j["altitude_m"].IsNull()) g.origin.altitude_m = j["altitude_m"].Double();
+  if (!j["heading_deg"].IsNull()) g.heading_deg = j["heading_deg"].Double();
+  g.heading_sigma_deg = j["heading_sigma_deg"].Double();
+  g.horizontal_sigma_m = j["horizontal_sigma_m"].Double();
+  g.vertical_sigma_m = j["vertical_sigma_m"].Double();
+  const Reader pivot = j["pivot"];
+  pivot.RequireSize(2);
+  g.pivot = {pivot.At(0).Double(), pivot.At(1).Double()};
+  g.num_fixes = j["num_fixes"].NonNegative();
+  g.num_outliers = j["num_outliers"].NonNegative();
+  g.residual_m = j["residual_m"].Double();
+  g.span_m = j["span_m"].Double();
+  g.note = j["note"].String();
+  return g;
+}
+
 TopologyState ReadTopology(const Reader& j) {
   TopologyState state;
   state.next_branch_id = j["next_branch_id"].NonNegative();
@@ -739,14 +777,23 @@ std::string BranchesCsv(const TreeModel& model) {
   return out;
 }
 
-std::string TreesCsv(const TreeModel& model) {
+std::string TreesCsv(const TreeModel& model, const Georeference* georeference) {
   std::string out =
       "tree_id,x,y,z,dbh_m,dbh_sigma_m,dbh_height_m,height_m,num_branches,max_branch_order,"
       "stem_volume_m3,wood_volume_m3_above_min_radius,min_radius_m,volume_sigma_m3,lean_deg,"
-      "arc_coverage_deg,num_scans,status\n";
+      "arc_coverage_deg,num_scans,status";
+  out += georeference != nullptr ? ",latitude_deg,longitude_deg,place_sigma_m\n" : "\n";
   for (const MapTree& t : model.trees) {
     const std::size_t branches = t.branch_ids.empty() ? 0 : t.branch_ids.size() - 1;
-    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
+    std::string place;
+    if (georeference != nullptr) {
+      const GeoPosition at = georeference->Locate(t.base);
+      place = fmt::format(",{},{},{}",
+                          Num(at.latitude_deg, 8),
+                          Num(at.longitude_deg, 8),
+                          Num(georeference->HorizontalSigma(t.base), 2));
+    }
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}{}\n",
                        t.id,
                        Vec(t.base),
                        t.dbh_m ? Num(*t.dbh_m) : std::string(),
@@ -762,7 +809,8 @@ std::string TreesCsv(const TreeModel& model) {
                        Num(t.lean_rad * kDegPerRad, 3),
                        Num(t.arc_coverage_rad * kDegPerRad, 1),
                        t.num_scans,
-                       ToString(t.dbh_m ? FitStatus::kMeasured : FitStatus::kUnresolved));
+                       ToString(t.dbh_m ? FitStatus::kMeasured : FitStatus::kUnresolved),
+                       place);
   }
   return out;
 }
@@ -813,6 +861,7 @@ std::string TreeMapJson(const MapFiles& files) {
   j["stamp_ns"] = files.model.stamp_ns;
   j["next_landmark_id"] = files.next_landmark_id;
   j["config"] = files.config;
+  if (files.georeference) j["georeference"] = GeoreferenceJson(*files.georeference);
   j["trees"] = Json::array();
   for (const MapTree& tree : files.model.trees) j["trees"].push_back(TreeJson(tree));
   j["branches"] = Json::array();
@@ -849,7 +898,9 @@ void SaveMap(const std::string& directory, const MapFiles& files, const StageTim
   std::vector<std::pair<std::string, std::string>> contents;
   contents.emplace_back("cylinders.csv", CylindersCsv(files.model));
   contents.emplace_back("branches.csv", BranchesCsv(files.model));
-  contents.emplace_back("trees.csv", TreesCsv(files.model));
+  contents.emplace_back(
+      "trees.csv",
+      TreesCsv(files.model, files.georeference ? &*files.georeference : nullptr));
   contents.emplace_back("trajectory.tum", TrajectoryTum(files.trajectory));
   contents.emplace_back("tree.ply", MeshToPly(ModelMesh(files.model, MeshColor::kByBranch)));
   if (timer != nullptr) contents.emplace_back("timing.json", TimingJson(*timer));
@@ -910,6 +961,8 @@ MapFiles LoadMap(const std::string& directory) {
     }
     return ids;
   };
+  // Absent from maps without fixes, and from those of before.
+  if (json.contains("georeference")) files.georeference = ReadGeoreference(j["georeference"]);
   read_list("trees", ReadTree, &files.model.trees);
   read_list("branches", ReadBranch, &files.model.branches);
   read_list("cylinders", ReadCylinder, &files.model.cylinders);

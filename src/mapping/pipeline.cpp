@@ -66,6 +66,7 @@ void TreeMappingConfig::Validate() const {
   mapper.Validate();
   topology.Validate();
   pose_buffer.Validate();
+  georeference.Validate();
 }
 
 void PipelineConfig::Validate() const {
@@ -117,9 +118,10 @@ std::pair<double, double> WoodSegmentationStage::UntimedSpan() const {
 }
 
 TreeMappingStage::TreeMappingStage(const TreeMappingConfig& config)
-    : config_(config), mapper_(config.mapper), topology_(config.topology) {
-  config.Validate();
-}
+    : config_((config.Validate(), config)),
+      mapper_(config.mapper),
+      topology_(config.topology),
+      georeferencer_(config.georeference) {}
 
 MapperResult TreeMappingStage::Process(const MapperInput& input,
                                        const std::optional<GroundPlane>& ground) {
@@ -163,6 +165,12 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   files.next_landmark_id = files.snapshot.next_landmark_id;
   files.topology = topology_.state();
   files.config = config;
+  files.georeference = georeferencer_.Solve(files.trajectory);
+  const bool loaded_is_better =
+      loaded_georeference_ &&
+      (!files.georeference ||
+       loaded_georeference_->heading_sigma_deg < files.georeference->heading_sigma_deg);
+  if (loaded_is_better) files.georeference = loaded_georeference_;
   return files;
 }
 
@@ -171,6 +179,8 @@ void TreeMappingStage::Load(const MapFiles& files) {
   loaded.Load(files.snapshot);
   mapper_ = std::move(loaded);
   topology_.Restore(files.topology);
+  georeferencer_.Clear();
+  loaded_georeference_ = files.georeference;
   ground_z_sum_m_ = 0.0;
   ground_count_ = 0;
   model_ = topology_.Build(mapper_.Landmarks(), files.model.stamp_ns);
@@ -179,6 +189,8 @@ void TreeMappingStage::Load(const MapFiles& files) {
 void TreeMappingStage::Reset() {
   mapper_.Reset();
   topology_.Reset();
+  georeferencer_.Clear();
+  loaded_georeference_.reset();
   model_ = TreeModel();
   ground_z_sum_m_ = 0.0;
   ground_count_ = 0;

@@ -8,6 +8,7 @@
 #include <nav_msgs/Path.h>
 #include <nodelet/nodelet.h>
 #include <pluginlib/class_list_macros.hpp>
+#include <sensor_msgs/NavSatFix.h>
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_broadcaster.h>
@@ -38,7 +39,8 @@ class TreeMapping : public nodelet::Nodelet {
     Odometry msg;
   };
   struct RestoreSession {};
-  using Input = std::variant<Cylinders, Odometry, IcpOdometry, RestoreSession>;
+  using Fix = sensor_msgs::NavSatFixConstPtr;
+  using Input = std::variant<Cylinders, Odometry, IcpOdometry, RestoreSession, Fix>;
   struct WaitingScan {
     Cylinders cylinders;
     std::shared_ptr<const dendro::RelativeMotion> icp;  ///< Null: ICP found no motion.
@@ -83,6 +85,8 @@ class TreeMapping : public nodelet::Nodelet {
               worker_->Push(IcpOdometry{msg}, false);
             });
       }
+      fix_subscriber_ = nh.subscribe<sensor_msgs::NavSatFix>(
+          "fix", 100, [this](const Fix& msg) { worker_->Push(msg, false); });
       cylinders_subscriber_ = nh.subscribe<dendro_slam::ScanCylinders>(
           "cylinders", 100, [this](const Cylinders& msg) {
             diagnostics_->Dropped("queue full", worker_->Push(msg, true));
@@ -105,6 +109,9 @@ class TreeMapping : public nodelet::Nodelet {
         }
       } else if (std::holds_alternative<RestoreSession>(input)) {
         Restore();
+      } else if (const auto* fix = std::get_if<Fix>(&input)) {
+        const auto geo = FromMsg(**fix);
+        if (!geo || !stage_->AddFix(*geo)) diagnostics_->Dropped("no GNSS fix");
       } else if (const auto* icp = std::get_if<IcpOdometry>(&input)) {
         join_->AddSecond(ToNs(icp->msg->header.stamp), *icp);
       } else {
@@ -346,6 +353,7 @@ class TreeMapping : public nodelet::Nodelet {
   ros::Subscriber latency_subscriber_;
   ros::Subscriber odometry_subscriber_;
   ros::Subscriber icp_subscriber_;
+  ros::Subscriber fix_subscriber_;
   ros::Subscriber cylinders_subscriber_;
   ros::ServiceServer save_;
   ros::ServiceServer load_;

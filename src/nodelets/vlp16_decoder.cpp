@@ -53,6 +53,16 @@ class Vlp16Decoder : public nodelet::Nodelet {
       diagnostics_->Show("packets lost", static_cast<double>(counters.lost));
       diagnostics_->Show("packets foreign", static_cast<double>(counters.foreign));
       diagnostics_->Show("packets truncated", static_cast<double>(counters.truncated));
+      diagnostics_->Show("packets duplicated", static_cast<double>(counters.duplicated));
+      diagnostics_->Show("packets reordered", static_cast<double>(counters.reordered));
+      diagnostics_->Show("blocks damaged", static_cast<double>(counters.bad_blocks));
+      diagnostics_->Show("clock jumps", static_cast<double>(counters.clock_jumps));
+      if (decoder_->odd_factory_byte() && !said_odd_factory_byte_) {
+        said_odd_factory_byte_ = true;
+        NODELET_WARN("%s: the packets name model 0x%02x, their timing is a VLP-16's: decoded as such",
+                     subscriber_.getTopic().c_str(),
+                     *decoder_->odd_factory_byte());
+      }
       if (counters.packets > 0 && counters.foreign == counters.packets) {
         NODELET_ERROR_THROTTLE(10.0,
                                "%s: the packets are not those of a VLP-16",
@@ -81,6 +91,7 @@ class Vlp16Decoder : public nodelet::Nodelet {
   std::optional<dendro::Vlp16Decoder> decoder_;
   std::optional<dendro::ScanAssembler> assembler_;
   std::vector<dendro::Vlp16Firing> firings_;
+  bool said_odd_factory_byte_ = false;
   ros::Publisher points_;
   ros::Subscriber subscriber_;
   std::unique_ptr<Worker<Input>> worker_;  // Last: its thread uses everything above.

@@ -203,6 +203,22 @@ OdometryPose FromMsg(const nav_msgs::Odometry& odometry) {
   return result;
 }
 
+std::optional<dendro::GeoFix> FromMsg(const sensor_msgs::NavSatFix& fix) {
+  if (fix.status.status < sensor_msgs::NavSatStatus::STATUS_FIX) return std::nullopt;
+  dendro::GeoFix out;
+  out.stamp_ns = ToNs(fix.header.stamp);
+  out.latitude_deg = fix.latitude;
+  out.longitude_deg = fix.longitude;
+  if (std::isfinite(fix.altitude)) out.altitude_m = fix.altitude;
+  if (fix.position_covariance_type != sensor_msgs::NavSatFix::COVARIANCE_TYPE_UNKNOWN) {
+    // East, north, up on the diagonal.
+    out.horizontal_sigma_m =
+        std::sqrt(0.5 * (fix.position_covariance[0] + fix.position_covariance[4]));
+    out.vertical_sigma_m = std::sqrt(fix.position_covariance[8]);
+  }
+  return out;
+}
+
 nav_msgs::Odometry ToIcpOdometry(const dendro::RelativeMotion& motion,
                                  const Eigen::Isometry3d& T_icp_lidar,
                                  const std::string& frame_id,

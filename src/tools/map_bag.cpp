@@ -3,6 +3,7 @@
 #include <CLI/CLI.hpp>
 #include <fmt/format.h>
 #include <nav_msgs/Odometry.h>
+#include <sensor_msgs/NavSatFix.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2/buffer_core.h>
 #include <tf2_msgs/TFMessage.h>
@@ -35,6 +36,7 @@ struct Options {
   bool per_scan = false;
   std::string points_topic;
   std::string odometry_topic;
+  std::string fix_topic;
 };
 
 void Say(const std::string& line) { fmt::print(stderr, "map_bag: {}\n", line); }
@@ -121,12 +123,15 @@ class Run {
                                          false);
     }
     if (odometry_topic_.empty()) Say("no odometry in the bag; ICP is the only odometry");
+    fix_topic_ = bag_.ChooseTopic(
+        options_.fix_topic, {"/fix"}, "sensor_msgs/NavSatFix", "GNSS fixes (--fix)", false);
     if (!options_.load.empty()) pipeline_.Load(dendro::LoadMap(options_.load));
     if (options_.per_scan) scan_writer_.emplace(options_.output);
     ReadTransforms(bag_, &tf_);
 
     std::vector<std::string> topics = {points_topic_};
     if (!odometry_topic_.empty()) topics.push_back(odometry_topic_);
+    if (!fix_topic_.empty()) topics.push_back(fix_topic_);
     dendro_ros::Progress progress("mapping");
     bag_.ForEach(
         topics,
@@ -162,6 +167,10 @@ class Run {
   void OnMessage(const rosbag::MessageInstance& message) {
     if (message.getTopic() == points_topic_) {
       if (const auto cloud = message.instantiate<sensor_msgs::PointCloud2>()) OnCloud(*cloud);
+    } else if (message.getTopic() == fix_topic_) {
+      if (const auto msg = message.instantiate<sensor_msgs::NavSatFix>()) {
+        if (const auto fix = dendro_ros::FromMsg(*msg)) pipeline_.AddFix(*fix);
+      }
     } else if (const auto odometry = message.instantiate<nav_msgs::Odometry>()) {
       OnOdometry(*odometry);
     }
@@ -263,6 +272,21 @@ class Run {
                files.model.trees.size(),
                files.model.branches.size(),
                files.model.cylinders.size());
+    if (files.georeference) Report(*files.georeference);
+  }
+
+  static void Report(const dendro::Georeference& g) {
+    fmt::print("{:.6f}, {:.6f} +- {:.1f} m ({} fixes, {} of them off)",
+               g.origin.latitude_deg,
+               g.origin.longitude_deg,
+               g.horizontal_sigma_m,
+               g.num_fixes,
+               g.num_outliers);
+    if (g.heading_deg) {
+      fmt::print(", x axis {:.1f} +- {:.1f} degrees from north\n", *g.heading_deg, g.heading_sigma_deg);
+    } else {
+      fmt::print("; {}\n", g.note);
+    }
   }
 
   static constexpr int kMaxWarnings = 10;
@@ -276,6 +300,7 @@ class Run {
   std::optional<dendro::ScanWriter> scan_writer_;
   std::string points_topic_;
   std::string odometry_topic_;
+  std::string fix_topic_;
   std::string last_error_;
   Counts counts_;
   std::int64_t first_ns_ = -1;
@@ -303,6 +328,7 @@ int main(int argc, char** argv) {
   app.add_flag("--per-scan", options.per_scan, "also write what every single scan gave");
   app.add_option("--points", options.points_topic, "topic of the scans");
   app.add_option("--odometry", options.odometry_topic, "topic of the odometry");
+  app.add_option("--fix", options.fix_topic, "topic of the GNSS fixes");
   CLI11_PARSE(app, argc, argv);
   try {
     Run run(options);

@@ -72,6 +72,13 @@ void Run(const Options& options) {
         counters.foreign));
   }
   bag.Close();
+  if (const auto model = reader.decoder().odd_factory_byte()) {
+    fmt::print(stderr,
+               "pcap_to_bag: {}: the packets name model {:#04x}, their timing is a VLP-16's: decoded as "
+               "such\n",
+               options.pcap,
+               *model);
+  }
   fmt::print("{}: {} scans in {:.2f} s, {} points, {} fixes; {} packets, {} lost, {} unusable\n",
              options.bag,
              num_scans,

@@ -224,6 +224,49 @@ TEST_F(Directory, TablesByHand) {
             "1.000000000\n");
 }
 
+TEST_F(Directory, TheGeoreferenceIsSavedAndExportedWithTheTrees) {
+  MapFiles files;
+  MapTree tree;
+  tree.id = 3;
+  tree.base = {0.0, 100.0, 0.0};
+  files.model.trees = {tree};
+  Georeference g;
+  g.origin = {45.0, 7.0, 321.5};
+  g.heading_deg = 90.0;  // The map's x axis points east, y north.
+  g.heading_sigma_deg = 2.5;
+  g.horizontal_sigma_m = 1.25;
+  g.vertical_sigma_m = 3.0;
+  g.pivot = {4.0, 100.0};
+  g.num_fixes = 60;
+  g.num_outliers = 2;
+  g.residual_m = 1.5;
+  g.span_m = 20.0;
+  files.georeference = g;
+  SaveMap(map_, files);
+  const MapFiles loaded = LoadMap(map_);
+  ASSERT_TRUE(loaded.georeference.has_value());
+  EXPECT_EQ(TreeMapJson(loaded), TreeMapJson(files));
+  EXPECT_EQ(loaded.georeference->origin.altitude_m, g.origin.altitude_m);
+  EXPECT_EQ(loaded.georeference->heading_deg, g.heading_deg);
+  EXPECT_EQ(loaded.georeference->num_outliers, 2);
+  // 100 m north of 45 degrees, where the meridian's radius is 6367382 m, and 321.5 m above it:
+  // 45 + deg(100 / 6367703.5). Sigma: hypot(1.25, 4 m x 2.5 degrees).
+  const std::string csv = TreesCsv(loaded.model, &*loaded.georeference);
+  EXPECT_THAT(csv, HasSubstr(",status,latitude_deg,longitude_deg,place_sigma_m\n"));
+  EXPECT_THAT(csv, HasSubstr(",UNRESOLVED,45.00089979,7.00000000,1.26\n"));
+  EXPECT_EQ(TreesCsv(loaded.model).find("latitude"), std::string::npos);
+
+  g.heading_deg.reset();
+  g.origin.altitude_m.reset();
+  g.note = "the heading is not known";
+  files.georeference = g;
+  SaveMap(map_, files);
+  const MapFiles again = LoadMap(map_);
+  EXPECT_FALSE(again.georeference->heading_deg.has_value());
+  EXPECT_FALSE(again.georeference->origin.altitude_m.has_value());
+  EXPECT_EQ(again.georeference->note, g.note);
+}
+
 TEST_F(Directory, EmptyMap) {
   SaveMap(map_, MapFiles());
   const MapFiles loaded = LoadMap(map_);

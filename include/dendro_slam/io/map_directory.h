@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <fstream>
 #include <map>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -12,6 +13,7 @@
 #include "dendro_slam/branch_separation/segment.h"
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/io/stage_timer.h"
+#include "dendro_slam/mapping/georeference.h"
 #include "dendro_slam/mapping/landmark.h"
 #include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/mapping/tree_model.h"
@@ -37,6 +39,7 @@ struct MapFiles {
   TopologyState topology;
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.
   std::string frame = "map";
+  std::optional<Georeference> georeference;  ///< Where the map lies on the earth, if there were fixes.
   std::map<std::string, std::string> config;  ///< "section/key" to value, as the run used it.
 };
 
@@ -61,7 +64,8 @@ MapFiles LoadMap(const std::string& directory);
 std::string TreeMapJson(const MapFiles& files);
 std::string CylindersCsv(const TreeModel& model);
 std::string BranchesCsv(const TreeModel& model);
-std::string TreesCsv(const TreeModel& model);
+/// @param georeference  Adds columns with the latitude and longitude of every tree, and their sigma.
+std::string TreesCsv(const TreeModel& model, const Georeference* georeference = nullptr);
 std::string TrajectoryTum(const std::vector<StampedPose>& trajectory);
 std::string TimingJson(const StageTimer& timer);
 

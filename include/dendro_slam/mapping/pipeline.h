@@ -13,6 +13,7 @@
 #include "dendro_slam/cylinder_fitting/cylinder_fitter.h"
 #include "dendro_slam/io/map_directory.h"
 #include "dendro_slam/io/stage_timer.h"
+#include "dendro_slam/mapping/georeference.h"
 #include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/odometry/wood_icp.h"
 #include "dendro_slam/range_image/projector.h"
@@ -46,6 +47,7 @@ struct TreeMappingConfig {
   MapperConfig mapper;
   TopologyConfig topology;
   PoseBufferConfig pose_buffer;
+  GeoreferencerConfig georeference;
 
   void Validate() const;
   template <class Visitor>
@@ -54,6 +56,7 @@ struct TreeMappingConfig {
     v("mapper", mapper);
     v("topology", topology);
     v("pose_buffer", pose_buffer);
+    v("georeference", georeference);
   }
 };
 
@@ -127,6 +130,10 @@ class TreeMappingStage {
   /// @param config  The settings to keep with the map, see DescribeConfig.
   MapFiles Files(const std::map<std::string, std::string>& config);
 
+  /// Adds a GNSS fix in the clock of the scans; the map is laid over its fixes when its files are
+  /// asked for. A loaded map keeps its place until fixes of this walk tell it better.
+  bool AddFix(const GeoFix& fix) { return georeferencer_.Add(fix); }
+
   /// Starts anew on a saved map.
   /// @throws std::invalid_argument for a map that is not consistent; then nothing has changed.
   void Load(const MapFiles& files);
@@ -141,6 +148,8 @@ class TreeMappingStage {
   Mapper mapper_;
   TreeTopology topology_;
   TreeModel model_;
+  Georeferencer georeferencer_;
+  std::optional<Georeference> loaded_georeference_;
   double ground_z_sum_m_ = 0.0;
   int ground_count_ = 0;
 };
@@ -171,6 +180,8 @@ class Pipeline {
   void SetMount(const Eigen::Isometry3d& T_base_lidar) { T_base_lidar_ = T_base_lidar; }
   /// Adds a pose of the odometry. Stamps ascend; others are refused.
   PoseBuffer::AddStatus AddOdometry(std::int64_t stamp_ns, const Eigen::Isometry3d& T_odom_base);
+  /// Adds a GNSS fix in the clock of the scans. Stamps ascend; others are refused.
+  bool AddFix(const GeoFix& fix) { return mapping_.AddFix(fix); }
   /// Stamp up to which odometry should be there before Process is called [ns].
   std::int64_t SweepEnd(const LidarScan& scan) const { return segmentation_.SweepEnd(scan); }
 

@@ -11,6 +11,7 @@
 #include <nav_msgs/Odometry.h>
 #include <ros/time.h>
 #include <sensor_msgs/Image.h>
+#include <sensor_msgs/NavSatFix.h>
 #include <sensor_msgs/PointCloud2.h>
 
 #include "dendro_slam/GraphStatus.h"
@@ -21,6 +22,7 @@
 #include "dendro_slam/TreeMap.h"
 #include "dendro_slam/branch_separation/segment.h"
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
+#include "dendro_slam/mapping/georeference.h"
 #include "dendro_slam/mapping/mapper_io.h"
 #include "dendro_slam/mapping/tree_model.h"
 #include "dendro_slam/odometry/relative_motion.h"
@@ -65,6 +67,10 @@ struct OdometryPose {
 };
 /// @throws std::invalid_argument  The pose is not finite or not a rigid motion.
 OdometryPose FromMsg(const nav_msgs::Odometry& odometry);
+
+/// A fix of a GNSS receiver.
+/// @return  Nothing when the receiver has no fix.
+std::optional<dendro::GeoFix> FromMsg(const sensor_msgs::NavSatFix& fix);
 
 /// The chained pose of the lidar as stage 1.5 (ICP) publishes it.
 ///
