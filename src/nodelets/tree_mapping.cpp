@@ -111,7 +111,7 @@ class TreeMapping : public nodelet::Nodelet {
         Restore();
       } else if (const auto* fix = std::get_if<Fix>(&input)) {
         const auto geo = FromMsg(**fix);
-        if (!geo || !stage_->AddFix(*geo)) diagnostics_->Dropped("no GNSS fix");
+        if (geo && stage_->AddFix(*geo)) diagnostics_->Show("GNSS fixes", ++num_fixes_);
       } else if (const auto* icp = std::get_if<IcpOdometry>(&input)) {
         join_->AddSecond(ToNs(icp->msg->header.stamp), *icp);
       } else {
@@ -347,6 +347,7 @@ class TreeMapping : public nodelet::Nodelet {
   Odometry last_icp_;
   int num_landmarks_ = 0;
   int num_all_landmarks_ = 0;
+  int num_fixes_ = 0;
   ros::Publisher map_;
   ros::Publisher path_;
   ros::Publisher status_;

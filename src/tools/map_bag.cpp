@@ -123,8 +123,16 @@ class Run {
                                          false);
     }
     if (odometry_topic_.empty()) Say("no odometry in the bag; ICP is the only odometry");
-    fix_topic_ = bag_.ChooseTopic(
-        options_.fix_topic, {"/fix"}, "sensor_msgs/NavSatFix", "GNSS fixes (--fix)", false);
+    try {
+      fix_topic_ = bag_.ChooseTopic(options_.fix_topic,
+                                    {"/fix", "/mavros/global_position/raw/fix"},
+                                    "sensor_msgs/NavSatFix",
+                                    "GNSS fixes (--fix)",
+                                    false);
+    } catch (const dendro_ros::BagError& error) {
+      if (!options_.fix_topic.empty()) throw;
+      Say(std::string(error.what()) + "; the map is not laid over them");
+    }
     if (!options_.load.empty()) pipeline_.Load(dendro::LoadMap(options_.load));
     if (options_.per_scan) scan_writer_.emplace(options_.output);
     ReadTransforms(bag_, &tf_);
