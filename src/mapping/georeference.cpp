@@ -293,10 +293,10 @@ std::optional<Georeference> Georeferencer::Solve(const std::vector<StampedPose>&
   if (heading_known) {
     out.heading_deg = WrapDeg(90.0 - best.psi / kDegToRad);
   } else {
-    // Sigma falls with the extent of the walk.
+    // The heading's sigma is the position's over the extent of the walk.
     std::array<char, 256> text{};
-    const double needed = out.span_m > 0.0 ? out.span_m * out.heading_sigma_deg / config_.max_heading_sigma_deg
-                                           : config_.default_sigma_m;
+    const double needed =
+        out.horizontal_sigma_m / (config_.max_heading_sigma_deg * kDegToRad);
     std::snprintf(text.data(), text.size(),
                   "the heading is not known: the walk extends over %.1f m (RMS) only, for fixes this good "
                   "it takes about %.0f m; all trees are put where the walk was, +-%.1f m",
