@@ -18,6 +18,8 @@
 #include <nlohmann/json.hpp>
 
 #include "dendro_slam/io/mesh.h"
+#include "dendro_slam/io/point_files.h"
+#include "dendro_slam/topology/dendrometry.h"
 
 namespace dendro {
 
@@ -27,6 +29,7 @@ using Json = nlohmann::ordered_json;
 
 constexpr char kFormatName[] = "dendro_slam tree map";
 constexpr int kFormatVersion = 1;
+constexpr char kPointsFile[] = "points.ply";
 constexpr double kDegPerRad = 180.0 / M_PI;
 
 // -------------------------------------------------------------------------------------------
@@ -277,6 +280,17 @@ Json BranchJson(const MapBranch& b) {
 
 Json TreeJson(const MapTree& t) {
   const auto finite = [&](double v) { return Finite(v, "a number of tree", t.id); };
+  Json crown = nullptr;
+  if (t.crown) {
+    crown = {{"volume_m3", finite(t.crown->volume_m3)},
+             {"projected_area_m2", finite(t.crown->projected_area_m2)},
+             {"hull_volume_m3", finite(t.crown->hull_volume_m3)},
+             {"hull_area_m2", finite(t.crown->hull_area_m2)},
+             {"base_height_m", finite(t.crown->base_height_m)},
+             {"top_height_m", finite(t.crown->top_height_m)},
+             {"alpha_m", finite(t.crown->alpha_m)},
+             {"num_points", t.crown->num_points}};
+  }
   return {{"id", t.id},
           {"trunk_branch_id", t.trunk_branch_id},
           {"branch_ids", t.branch_ids},
@@ -284,6 +298,7 @@ Json TreeJson(const MapTree& t) {
           {"dbh_height_m", finite(t.dbh_height_m)},
           {"dbh_m", t.dbh_m ? Json(finite(*t.dbh_m)) : Json(nullptr)},
           {"dbh_sigma_m", finite(t.dbh_sigma_m)},
+          {"dbh_status", ToString(t.dbh_status)},
           {"height_m", finite(t.height_m)},
           {"max_branch_order", t.max_branch_order},
           {"stem_volume_m3", finite(t.stem_volume_m3)},
@@ -292,7 +307,8 @@ Json TreeJson(const MapTree& t) {
           {"volume_sigma_m3", finite(t.volume_sigma_m3)},
           {"lean_rad", finite(t.lean_rad)},
           {"arc_coverage_rad", finite(t.arc_coverage_rad)},
-          {"num_scans", t.num_scans}};
+          {"num_scans", t.num_scans},
+          {"crown", std::move(crown)}};
 }
 
 Json TopologyJson(const TopologyState& state) {
@@ -312,9 +328,18 @@ Json TopologyJson(const TopologyState& state) {
     Json list = Json::array();
     for (const TopologyState::Section& section : sections) {
       list.push_back({{"id", section.id},
+                      {"index", section.index},
+                      {"branch_id", section.branch_id},
                       {"middle", VecJson(section.middle, "the middle of cylinder", section.id)}});
     }
     j["sections"].push_back({{"key", {key.first, key.second}}, {"cylinders", std::move(list)}});
+  }
+  j["origins"] = Json::array();
+  for (const auto& [landmark, origin] : state.origins) {
+    j["origins"].push_back(
+        {{"landmark_id", landmark},
+         {"point", VecJson(origin.point, "the origin of landmark", landmark)},
+         {"direction", VecJson(origin.direction, "the origin of landmark", landmark)}});
   }
   return j;
 }
@@ -348,6 +373,12 @@ class Reader {
   std::size_t ArraySize() const {
     if (!json_.is_array()) Fail("is not a list");
     return json_.size();
+  }
+
+  // A key that older files lack.
+  bool Has(const char* key) const {
+    if (!json_.is_object()) Fail("is not an object");
+    return json_.find(key) != json_.end();
   }
 
   void RequireSize(std::size_t size) const {
@@ -587,6 +618,8 @@ MapTree ReadTree(const Reader& j) {
   t.dbh_height_m = j["dbh_height_m"].Double();
   if (!j["dbh_m"].IsNull()) t.dbh_m = j["dbh_m"].Double();
   t.dbh_sigma_m = j["dbh_sigma_m"].Double();
+  t.dbh_status = t.dbh_m ? FitStatus::kMeasured : FitStatus::kUnresolved;
+  if (j.Has("dbh_status")) t.dbh_status = ReadStatus(j["dbh_status"]);
   t.height_m = j["height_m"].Double();
   t.max_branch_order = j["max_branch_order"].Int();
   t.stem_volume_m3 = j["stem_volume_m3"].Double();
@@ -596,6 +629,18 @@ MapTree ReadTree(const Reader& j) {
   t.lean_rad = j["lean_rad"].Double();
   t.arc_coverage_rad = j["arc_coverage_rad"].Double();
   t.num_scans = j["num_scans"].Int();
+  if (j.Has("crown") && !j["crown"].IsNull()) {
+    const Reader c = j["crown"];
+    MapCrown& crown = t.crown.emplace();
+    crown.volume_m3 = c["volume_m3"].Double();
+    crown.projected_area_m2 = c["projected_area_m2"].Double();
+    crown.hull_volume_m3 = c["hull_volume_m3"].Double();
+    crown.hull_area_m2 = c["hull_area_m2"].Double();
+    crown.base_height_m = c["base_height_m"].Double();
+    crown.top_height_m = c["top_height_m"].Double();
+    crown.alpha_m = c["alpha_m"].Double();
+    crown.num_points = c["num_points"].NonNegative();
+  }
   return t;
 }
 
@@ -646,7 +691,19 @@ TopologyState ReadTopology(const Reader& j) {
     for (std::size_t k = 0; k < count; ++k) {
       const int id = list.At(k)["id"].NonNegative();
       if (id >= state.next_cylinder_id) list.At(k)["id"].Fail("names an id that was never given");
-      target.push_back({id, list.At(k)["middle"].Vector()});
+      TopologyState::Section section{id, static_cast<int>(k), -1, list.At(k)["middle"].Vector()};
+      if (list.At(k).Has("index")) section.index = list.At(k)["index"].Int();
+      if (list.At(k).Has("branch_id")) section.branch_id = list.At(k)["branch_id"].Int();
+      target.push_back(section);
+    }
+  }
+  if (j.Has("origins")) {
+    const Reader origins = j["origins"];
+    const std::size_t num_origins = origins.ArraySize();
+    for (std::size_t i = 0; i < num_origins; ++i) {
+      const Reader origin = origins.At(i);
+      state.origins[origin["landmark_id"].NonNegative()] = {origin["point"].Vector(),
+                                                            origin["direction"].UnitVector()};
     }
   }
   return state;
@@ -752,10 +809,13 @@ std::string BranchesCsv(const TreeModel& model) {
   std::string out =
       "tree_id,branch_id,parent_branch_id,branch_order,num_cylinders,num_measured,"
       "base_x,base_y,base_z,tip_x,tip_y,tip_z,length_m,base_diameter_m,base_diameter_sigma_m,"
-      "middle_diameter_m,tip_diameter_m,angle_deg,azimuth_deg,zenith_deg,height_m\n";
+      "middle_diameter_m,tip_diameter_m,angle_deg,azimuth_deg,zenith_deg,height_m,"
+      "middle_diameter_sigma_m,tip_diameter_sigma_m,base_status,middle_status,tip_status,"
+      "inferred_length_m,visible_arc_deg,num_scans\n";
   for (const MapBranch& b : model.branches) {
     const auto [cylinders, measured] = counts[b.id];
-    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
+    const BranchMeasures m = MeasureBranch(model, b);
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}\n",
                        Optional(b.tree_id),
                        b.id,
                        Optional(b.parent_id),
@@ -772,7 +832,15 @@ std::string BranchesCsv(const TreeModel& model) {
                        b.parent_id >= 0 ? Num(b.angle_rad * kDegPerRad, 3) : std::string(),
                        Num(b.azimuth_rad * kDegPerRad, 3),
                        Num(b.zenith_rad * kDegPerRad, 3),
-                       b.tree_id >= 0 ? Num(b.height_m) : std::string());
+                       b.tree_id >= 0 ? Num(b.height_m) : std::string(),
+                       Num(m.middle.sigma_m),
+                       Num(m.tip.sigma_m),
+                       ToString(m.base.status),
+                       ToString(m.middle.status),
+                       ToString(m.tip.status),
+                       Num(m.inferred_length_m),
+                       Num(m.visible_arc_rad * kDegPerRad, 1),
+                       m.num_scans);
   }
   return out;
 }
@@ -781,8 +849,12 @@ std::string TreesCsv(const TreeModel& model, const Georeference* georeference) {
   std::string out =
       "tree_id,x,y,z,dbh_m,dbh_sigma_m,dbh_height_m,height_m,num_branches,max_branch_order,"
       "stem_volume_m3,wood_volume_m3_above_min_radius,min_radius_m,volume_sigma_m3,lean_deg,"
-      "arc_coverage_deg,num_scans,status";
+      "arc_coverage_deg,num_scans,crown_volume_m3,crown_projected_area_m2,"
+      "crown_base_height_m,crown_top_height_m,crown_alpha_m,crown_points,status";
   out += georeference != nullptr ? ",latitude_deg,longitude_deg,place_sigma_m\n" : "\n";
+  const auto crown = [](const MapTree& t, double MapCrown::*figure) {
+    return t.crown ? Num((*t.crown).*figure) : std::string();
+  };
   for (const MapTree& t : model.trees) {
     const std::size_t branches = t.branch_ids.empty() ? 0 : t.branch_ids.size() - 1;
     std::string place;
@@ -793,7 +865,7 @@ std::string TreesCsv(const TreeModel& model, const Georeference* georeference) {
                           Num(at.longitude_deg, 8),
                           Num(georeference->HorizontalSigma(t.base), 2));
     }
-    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}{}\n",
+    out += fmt::format("{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}{}\n",
                        t.id,
                        Vec(t.base),
                        t.dbh_m ? Num(*t.dbh_m) : std::string(),
@@ -809,7 +881,13 @@ std::string TreesCsv(const TreeModel& model, const Georeference* georeference) {
                        Num(t.lean_rad * kDegPerRad, 3),
                        Num(t.arc_coverage_rad * kDegPerRad, 1),
                        t.num_scans,
-                       ToString(t.dbh_m ? FitStatus::kMeasured : FitStatus::kUnresolved),
+                       crown(t, &MapCrown::volume_m3),
+                       crown(t, &MapCrown::projected_area_m2),
+                       crown(t, &MapCrown::base_height_m),
+                       crown(t, &MapCrown::top_height_m),
+                       crown(t, &MapCrown::alpha_m),
+                       t.crown ? std::to_string(t.crown->num_points) : std::string(),
+                       ToString(t.dbh_status),
                        place);
   }
   return out;
@@ -860,6 +938,7 @@ std::string TreeMapJson(const MapFiles& files) {
   j["frame"] = files.frame;
   j["stamp_ns"] = files.model.stamp_ns;
   j["next_landmark_id"] = files.next_landmark_id;
+  j["num_points"] = files.points.size();
   j["config"] = files.config;
   if (files.georeference) j["georeference"] = GeoreferenceJson(*files.georeference);
   j["trees"] = Json::array();
@@ -903,6 +982,7 @@ void SaveMap(const std::string& directory, const MapFiles& files, const StageTim
       TreesCsv(files.model, files.georeference ? &*files.georeference : nullptr));
   contents.emplace_back("trajectory.tum", TrajectoryTum(files.trajectory));
   contents.emplace_back("tree.ply", MeshToPly(ModelMesh(files.model, MeshColor::kByBranch)));
+  if (!files.points.empty()) contents.emplace_back(kPointsFile, PointsToPly(files.points));
   if (timer != nullptr) contents.emplace_back("timing.json", TimingJson(*timer));
   contents.emplace_back("tree_map.json", TreeMapJson(files));
 
@@ -922,6 +1002,8 @@ void SaveMap(const std::string& directory, const MapFiles& files, const StageTim
     for (const std::string& temporary : temporaries) ::unlink(temporary.c_str());
     throw;
   }
+  // Those of an older map do not belong to this one; LoadMap would not read them either.
+  if (files.points.empty()) ::unlink((root / kPointsFile).c_str());
   SyncDirectory(directory);
 }
 
@@ -977,6 +1059,15 @@ MapFiles LoadMap(const std::string& directory) {
 
   const std::filesystem::path trajectory = root / "trajectory.tum";
   if (std::filesystem::exists(trajectory)) files.trajectory = ReadTrajectory(trajectory.string());
+  const std::int64_t num_points = j.Has("num_points") ? j["num_points"].Int64() : 0;
+  if (num_points > 0) {
+    const std::string points = (root / kPointsFile).string();
+    files.points = PointsFromPly(ReadFile(points), points);
+    if (static_cast<std::int64_t>(files.points.size()) != num_points) {
+      throw MapFileError(fmt::format(
+          "{}: holds {} points, {} says {}", points, files.points.size(), file, num_points));
+    }
+  }
   return files;
 }
 

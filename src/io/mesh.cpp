@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <set>
 #include <stdexcept>
 
 #include <fmt/format.h>
@@ -91,7 +92,8 @@ double EndRadius(const MapCylinder& cylinder) {
   return std::max(0.0, cylinder.radius_m + 0.5 * cylinder.taper_m_per_m * cylinder.Length());
 }
 
-void AppendFrustum(const MapCylinder& cylinder, const Rgb& color, int sides, Mesh* mesh) {
+void AppendFrustum(
+    const MapCylinder& cylinder, const Rgb& color, int sides, Mesh* mesh, bool caps) {
   if (sides < 3) throw std::invalid_argument("sides: a frustum needs at least 3");
   if (!(cylinder.Length() > 0.0)) return;
   const Eigen::Vector3d axis = cylinder.Axis();
@@ -105,14 +107,17 @@ void AppendFrustum(const MapCylinder& cylinder, const Rgb& color, int sides, Mes
     mesh->vertices.push_back(cylinder.start + r0 * direction);
     mesh->vertices.push_back(cylinder.end + r1 * direction);
   }
-  mesh->vertices.push_back(cylinder.start);
-  mesh->vertices.push_back(cylinder.end);
-  mesh->colors.insert(mesh->colors.end(), static_cast<std::size_t>(2 * sides + 2), color);
+  if (caps) {
+    mesh->vertices.push_back(cylinder.start);
+    mesh->vertices.push_back(cylinder.end);
+  }
+  mesh->colors.resize(mesh->vertices.size(), color);
   const std::int32_t bottom = first + 2 * sides, top = bottom + 1;
   for (int i = 0; i < sides; ++i) {
     const std::int32_t a = first + 2 * i, b = first + 2 * ((i + 1) % sides);
     mesh->triangles.push_back({a, b, b + 1});
     mesh->triangles.push_back({a, b + 1, a + 1});
+    if (!caps) continue;
     mesh->triangles.push_back({bottom, b, a});
     mesh->triangles.push_back({top, a + 1, b + 1});
   }
@@ -126,11 +131,21 @@ Mesh ModelMesh(const TreeModel& model, MeshColor scheme, int sides) {
   return mesh;
 }
 
-Mesh TreeMesh(const TreeModel& model, int tree_id, MeshColor scheme, int sides) {
+Mesh TreeMesh(
+    const TreeModel& model, int tree_id, MeshColor scheme, int sides, bool inner_caps) {
   Mesh mesh;
+  std::set<int> ends;
+  if (!inner_caps) {
+    for (const MapBranch& branch : model.branches) {
+      if (branch.tree_id != tree_id || branch.cylinder_ids.empty()) continue;
+      ends.insert(branch.cylinder_ids.front());
+      ends.insert(branch.cylinder_ids.back());
+    }
+  }
   for (const MapCylinder& cylinder : model.cylinders) {
     if (cylinder.tree_id != tree_id) continue;
-    AppendFrustum(cylinder, CylinderColor(cylinder, scheme), sides, &mesh);
+    const bool caps = inner_caps || ends.count(cylinder.id) > 0;
+    AppendFrustum(cylinder, CylinderColor(cylinder, scheme), sides, &mesh, caps);
   }
   return mesh;
 }

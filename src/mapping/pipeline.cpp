@@ -9,6 +9,7 @@
 #include <utility>
 
 #include "dendro_slam/sensors/deskew.h"
+#include "dendro_slam/topology/crown.h"
 
 namespace dendro {
 namespace {
@@ -65,6 +66,7 @@ void TreeMappingConfig::Validate() const {
   CheckTimeout("tree_mapping", odometry_timeout_s);
   mapper.Validate();
   topology.Validate();
+  map_cloud.Validate();
   pose_buffer.Validate();
   georeference.Validate();
 }
@@ -121,6 +123,7 @@ TreeMappingStage::TreeMappingStage(const TreeMappingConfig& config)
     : config_((config.Validate(), config)),
       mapper_(config.mapper),
       topology_(config.topology),
+      cloud_(config.map_cloud),
       georeferencer_(config.georeference) {}
 
 MapperResult TreeMappingStage::Process(const MapperInput& input,
@@ -131,6 +134,10 @@ MapperResult TreeMappingStage::Process(const MapperInput& input,
     model_ = topology_.Build(mapper_.Landmarks(), result.stamp_ns, GroundHeight());
   }
   return result;
+}
+
+void TreeMappingStage::AddPoints(const LabelledScan& scan, const Eigen::Isometry3d& T_map_lidar) {
+  if (config_.map_cloud.enabled && !mapper_.relocalizing()) cloud_.Add(scan, T_map_lidar);
 }
 
 void TreeMappingStage::AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
@@ -159,6 +166,10 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   const std::int64_t stamp_ns =
       files.trajectory.empty() ? model_.stamp_ns : files.trajectory.back().stamp_ns;
   model_ = topology_.Build(mapper_.Landmarks(), stamp_ns, GroundHeight());
+  files.points = cloud_.Points(files.trajectory);
+  AssignPoints(
+      model_, config_.map_cloud.wood_reach_m, config_.map_cloud.leaf_reach_m, &files.points);
+  MeasureCrowns(files.points, config_.map_cloud.crown_alpha_m, &model_);
   files.model = model_;
   files.landmarks = mapper_.AllLandmarks();
   files.snapshot = mapper_.Snapshot();
@@ -181,6 +192,7 @@ void TreeMappingStage::Load(const MapFiles& files) {
   topology_.Restore(files.topology);
   georeferencer_.Clear();
   loaded_georeference_ = files.georeference;
+  cloud_.Restore(files.points);
   ground_z_sum_m_ = 0.0;
   ground_count_ = 0;
   model_ = topology_.Build(mapper_.Landmarks(), files.model.stamp_ns);
@@ -191,6 +203,7 @@ void TreeMappingStage::Reset() {
   topology_.Reset();
   georeferencer_.Clear();
   loaded_georeference_.reset();
+  cloud_.Reset();
   model_ = TreeModel();
   ground_z_sum_m_ = 0.0;
   ground_count_ = 0;
@@ -236,6 +249,7 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
   }
   stage.Lap();
   result.mapping = mapping_.Process(input, ground);
+  mapping_.AddPoints(result.scan, result.mapping.T_map_lidar);
   timer_.Add("mapping", stage.Lap());
   timer_.Add("total", total.Lap());
   return result;

@@ -9,6 +9,7 @@
 #include <nodelet/nodelet.h>
 #include <pluginlib/class_list_macros.hpp>
 #include <sensor_msgs/NavSatFix.h>
+#include <sensor_msgs/PointCloud2.h>
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_broadcaster.h>
@@ -40,7 +41,9 @@ class TreeMapping : public nodelet::Nodelet {
   };
   struct RestoreSession {};
   using Fix = sensor_msgs::NavSatFixConstPtr;
-  using Input = std::variant<Cylinders, Odometry, IcpOdometry, RestoreSession, Fix>;
+  using WoodScan = sensor_msgs::PointCloud2ConstPtr;
+  using Input = std::variant<Cylinders, Odometry, IcpOdometry, WoodScan, RestoreSession, Fix>;
+  using CloudJoin = StampJoin<Eigen::Isometry3d, WoodScan>;
   struct WaitingScan {
     Cylinders cylinders;
     std::shared_ptr<const dendro::RelativeMotion> icp;  ///< Null: ICP found no motion.
@@ -87,6 +90,11 @@ class TreeMapping : public nodelet::Nodelet {
       }
       fix_subscriber_ = nh.subscribe<sensor_msgs::NavSatFix>(
           "fix", 100, [this](const Fix& msg) { worker_->Push(msg, false); });
+      cloud_join_.emplace(capacity, CloudJoin::Missing::kDrop);
+      if (config_.stage.map_cloud.enabled) {
+        wood_scan_subscriber_ = nh.subscribe<sensor_msgs::PointCloud2>(
+            "wood_scan", 100, [this](const WoodScan& msg) { worker_->Push(msg, false); });
+      }
       cylinders_subscriber_ = nh.subscribe<dendro_slam::ScanCylinders>(
           "cylinders", 100, [this](const Cylinders& msg) {
             diagnostics_->Dropped("queue full", worker_->Push(msg, true));
@@ -114,12 +122,18 @@ class TreeMapping : public nodelet::Nodelet {
         if (geo && stage_->AddFix(*geo)) diagnostics_->Show("GNSS fixes", ++num_fixes_);
       } else if (const auto* icp = std::get_if<IcpOdometry>(&input)) {
         join_->AddSecond(ToNs(icp->msg->header.stamp), *icp);
+      } else if (const auto* scan = std::get_if<WoodScan>(&input)) {
+        cloud_join_->AddSecond(ToNs((*scan)->header.stamp), *scan);
       } else {
         AddCylinders(std::get<Cylinders>(input));
       }
       while (auto joined = join_->Pop()) AddJoined(joined->first, joined->second);
       diagnostics_->Dropped("queue full", join_->TakeDropped());
       while (const auto waiting = gate_->Pop()) Process(*waiting);
+      while (const auto mapped = cloud_join_->Pop()) {
+        stage_->AddPoints(FromWoodScan(**mapped->second, wood_scan_subscriber_.getTopic()),
+                          mapped->first);
+      }
     } catch (const std::exception& error) {
       diagnostics_->Dropped("unusable");
       diagnostics_->Problem(error.what());
@@ -168,6 +182,7 @@ class TreeMapping : public nodelet::Nodelet {
     stage_->Reset();
     if (session_) session_->StartAnew();
     last_icp_.reset();
+    cloud_join_.emplace(static_cast<std::size_t>(config_.queue_size), CloudJoin::Missing::kDrop);
     latencies_.Reset();
     diagnostics_->ResetCounts();
   }
@@ -184,6 +199,9 @@ class TreeMapping : public nodelet::Nodelet {
     if (T_odom_body) input.T_odom_lidar = *T_odom_body * gate_->T_body_lidar();
     const dendro::MapperResult result = stage_->Process(input, GroundFromMsg(*scan.cylinders));
     KeepInSession(input, *scan.cylinders, result.is_key_frame);
+    if (config_.stage.map_cloud.enabled) {
+      cloud_join_->AddFirst(input.stamp_ns, result.T_map_lidar);
+    }
     diagnostics_->Processed(input.stamp_ns, watch.Seconds());
     if (!result.warning.empty()) NODELET_WARN_THROTTLE(5.0, "%s", result.warning.c_str());
     // WoodSegmentation needs the same transform and says on the console what is missing.
@@ -344,6 +362,8 @@ class TreeMapping : public nodelet::Nodelet {
   tf2_ros::TransformBroadcaster broadcaster_;
   std::optional<StampJoin<Cylinders, IcpOdometry>> join_;
   std::optional<ScanGate<WaitingScan>> gate_;
+  /// Poses of mapped scans with their returns, for the map's points.
+  std::optional<CloudJoin> cloud_join_;
   Odometry last_icp_;
   int num_landmarks_ = 0;
   int num_all_landmarks_ = 0;
@@ -356,6 +376,7 @@ class TreeMapping : public nodelet::Nodelet {
   ros::Subscriber icp_subscriber_;
   ros::Subscriber fix_subscriber_;
   ros::Subscriber cylinders_subscriber_;
+  ros::Subscriber wood_scan_subscriber_;
   ros::ServiceServer save_;
   ros::ServiceServer load_;
   ros::ServiceServer reset_;

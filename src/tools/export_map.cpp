@@ -11,8 +11,10 @@
 #include <CLI/CLI.hpp>
 
 #include "dendro_slam/io/exports.h"
+#include "dendro_slam/io/geojson.h"
 #include "dendro_slam/io/map_directory.h"
 #include "dendro_slam/io/mesh.h"
+#include "dendro_slam/io/point_files.h"
 
 namespace {
 
@@ -42,7 +44,8 @@ int main(int argc, char** argv) {
          "-f,--format",
          format,
          "treeqsm-mat, treeqsm-txt, simpleforest, raycloudtools, treeloc (a folder), ply-branch, "
-         "ply-order, ply-sigma, json, csv (a folder with our own tables)")
+         "ply-order, ply-sigma, las or ply-points (wood and leaf points, where the map was made with "
+         "map_cloud/enabled), geojson (needs --georeference), json, csv (a folder with our own tables)")
       ->required()
       ->check(CLI::IsMember({"treeqsm-mat",
                              "treeqsm-txt",
@@ -52,6 +55,9 @@ int main(int argc, char** argv) {
                              "ply-branch",
                              "ply-order",
                              "ply-sigma",
+                             "las",
+                             "geojson",
+                             "ply-points",
                              "json",
                              "csv"}));
   app.add_option("-o,--output", output, "File (or folder) to write")->required();
@@ -59,6 +65,13 @@ int main(int argc, char** argv) {
   app.add_option("--every", every, "treeloc: every n-th pose is a key frame")
       ->check(CLI::PositiveNumber)
       ->capture_default_str();
+  std::vector<double> georeference;
+  app.add_option("--georeference",
+                 georeference,
+                 "geojson: latitude and longitude of the map's origin [deg], bearing of its x axis "
+                 "clockwise from north [deg], and its altitude [m] (0)")
+      ->expected(3, 4)
+      ->delimiter(',');
   CLI11_PARSE(app, argc, argv);
 
   try {
@@ -103,6 +116,28 @@ int main(int argc, char** argv) {
       outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByOrder)));
     if (format == "ply-sigma")
       outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kBySigma)));
+    if (format == "las" || format == "ply-points") {
+      outputs.emplace_back(output,
+                           format == "las" ? PointsToLas(files.points) : PointsToPly(files.points));
+      if (files.points.empty()) {
+        fmt::print(stderr,
+                   "export_map: {} holds no points: it was made without map_cloud/enabled\n",
+                   map_dir);
+      }
+    }
+    if (format == "geojson") {
+      if (georeference.empty()) {
+        throw MapFileError(
+            "geojson: the map does not say where it lies; give --georeference "
+            "LATITUDE,LONGITUDE,HEADING[,ALTITUDE]");
+      }
+      MapPlacement reference;
+      reference.latitude_deg = georeference[0];
+      reference.longitude_deg = georeference[1];
+      reference.heading_deg = georeference[2];
+      if (georeference.size() > 3) reference.altitude_m = georeference[3];
+      outputs.emplace_back(output, ModelGeoJson(model, reference));
+    }
     if (format == "json") outputs.emplace_back(output, TreeMapJson(files));
     for (const auto& [path, content] : outputs) WriteFileAtomically(path, content);
     const int unattached = CountUnattached(model);

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <map>
+#include <stdexcept>
 
 namespace dendro {
 
@@ -117,6 +118,36 @@ std::vector<StemDiameter> StemTaper(const TreeModel& model, const MapTree& tree)
   return taper;
 }
 
+BranchMeasures MeasureBranch(const TreeModel& model, const MapBranch& branch) {
+  BranchMeasures measures;
+  bool seen = false;
+  double walked = 0.0;
+  const auto diameter = [](const MapCylinder& c, double f) {
+    const double radius = c.radius_m + (f - 0.5) * c.taper_m_per_m * c.Length();
+    return BranchDiameter{2.0 * std::max(0.0, radius), 2.0 * c.radius_sigma_m, c.status};
+  };
+  for (std::size_t i = 0; i < branch.cylinder_ids.size(); ++i) {
+    const MapCylinder* c = FindById(model.cylinders, branch.cylinder_ids[i]);
+    if (c == nullptr) throw std::out_of_range("a branch names a cylinder that is not in the model");
+    const double length = c->Length(), half = 0.5 * branch.length_m - walked;
+    if (i == 0) measures.base = diameter(*c, 0.0);
+    if (half >= 0.0 && half <= length) {
+      measures.middle = diameter(*c, length > 0.0 ? half / length : 0.5);
+    }
+    measures.tip = diameter(*c, 1.0);
+    walked += length;
+    if (c->status != FitStatus::kMeasured) {
+      measures.inferred_length_m += length;
+      continue;
+    }
+    measures.visible_arc_rad =
+        seen ? std::min(measures.visible_arc_rad, c->visible_arc_rad) : c->visible_arc_rad;
+    measures.num_scans = std::max(measures.num_scans, c->num_scans);
+    seen = true;
+  }
+  return measures;
+}
+
 WoodVolume Volume(const TreeModel& model, const MapTree& tree, int order, double min_radius_m) {
   std::map<int, double> sigma_of_branch;
   WoodVolume result;
@@ -140,7 +171,9 @@ void MeasureTrees(double breast_height_m, double min_volume_radius_m, TreeModel*
     if (dbh) {
       tree.dbh_m = dbh->diameter_m;
       tree.dbh_sigma_m = dbh->sigma_m;
+      tree.dbh_status = dbh->status;
     } else {
+      tree.dbh_status = FitStatus::kUnresolved;
       tree.dbh_m.reset();
       tree.dbh_sigma_m = 0.0;
     }

@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
+#include <utility>
 
 namespace dendro {
 
@@ -27,6 +28,10 @@ constexpr double kStraightOnDeg = 14.0;
 constexpr double kMaxForkBendDeg = 60.0;
 constexpr double kForkOpeningDeg = 25.0;
 constexpr double kForkRadiusRatio = 1.6;
+// Two pieces that run the same way to within this, their axes closer than this part of their radii's
+// sum, fill the same space.
+constexpr double kSameWayDeg = 15.0;
+constexpr double kPenetration = 0.75;
 
 // -------------------------------------------------------------------------------------------
 // Geometry
@@ -150,6 +155,55 @@ double SigmaAt(const Landmark& landmark, double s) {
   return std::sqrt(std::max(0.0, landmark.covariance(4, 4))) * r * r;
 }
 
+// Share of a piece's length along which it stands in the wood of another that runs the same way.
+double ShareInside(const Piece& piece, const Piece& other) {
+  const Vector3d& axis = other.landmark->cylinder.axis;
+  if (std::abs(piece.landmark->cylinder.axis.dot(axis)) < std::cos(kSameWayDeg * kDeg)) return 0.0;
+  constexpr int kSamples = 10;
+  int inside = 0;
+  for (int i = 0; i < kSamples; ++i) {
+    const double f = (i + 0.5) / kSamples;
+    const Vector3d p = (1.0 - f) * piece.end[0] + f * piece.end[1];
+    const double s = (p - other.end[0]).dot(axis);
+    if (s < 0.0 || s > other.length) continue;
+    const double g = s / std::max(other.length, 1e-9);
+    const double radii = (1.0 - f) * piece.radius[0] + f * piece.radius[1] +
+                         (1.0 - g) * other.radius[0] + g * other.radius[1];
+    if ((p - other.end[0] - s * axis).norm() < kPenetration * radii) ++inside;
+  }
+  return static_cast<double>(inside) / kSamples;
+}
+
+// Two branches cannot fill the same space: where two pieces that run the same way do, over half of
+// the shorter one, one branch was taken for two (drift between two looks at it). The better seen
+// of the two stays; the other is left out of the model while that is so.
+std::vector<Piece> WithoutDuplicates(const std::vector<Piece>& pieces) {
+  std::vector<std::size_t> best_first(pieces.size());
+  for (std::size_t i = 0; i < pieces.size(); ++i) best_first[i] = i;
+  const auto weight = [&](std::size_t i) {
+    return pieces[i].length * static_cast<double>(pieces[i].landmark->num_scans);
+  };
+  std::stable_sort(best_first.begin(), best_first.end(), [&](std::size_t a, std::size_t b) {
+    return weight(a) > weight(b);
+  });
+  std::vector<bool> kept(pieces.size(), false);
+  for (const std::size_t i : best_first) {
+    kept[i] = true;
+    for (std::size_t k = 0; k < pieces.size() && kept[i]; ++k) {
+      if (!kept[k] || k == i) continue;
+      const bool shorter = pieces[i].length <= pieces[k].length;
+      const Piece& small = shorter ? pieces[i] : pieces[k];
+      const Piece& large = shorter ? pieces[k] : pieces[i];
+      kept[i] = ShareInside(small, large) <= 0.5;
+    }
+  }
+  std::vector<Piece> result;
+  for (std::size_t i = 0; i < pieces.size(); ++i) {
+    if (kept[i]) result.push_back(pieces[i]);
+  }
+  return result;
+}
+
 std::vector<Piece> MakePieces(const std::vector<Landmark>& landmarks) {
   std::vector<Piece> pieces;
   std::set<int> ids;
@@ -172,7 +226,7 @@ std::vector<Piece> MakePieces(const std::vector<Landmark>& landmarks) {
   std::sort(pieces.begin(), pieces.end(), [](const Piece& a, const Piece& b) {
     return a.landmark->id < b.landmark->id;
   });
-  return pieces;
+  return WithoutDuplicates(pieces);
 }
 
 struct Joint {
@@ -508,33 +562,50 @@ std::vector<int> MinimumArborescence(int num_vertices, int root, const std::vect
 // Cutting into cylinders
 // -------------------------------------------------------------------------------------------
 
-// Ends of the sections of a stretch [s0, s1]: at radius knots where these are between the shortest
-// and the longest section apart, evenly between knots that are farther apart.
-std::vector<double> SectionCuts(const Landmark& landmark,
-                                double s0,
-                                double s1,
-                                const TopologyConfig& config) {
-  std::vector<double> cuts = {s0};
-  double pending = s0;
-  const auto advance = [&](double k) {
-    while (k - cuts.back() > config.max_section_length_m * (1.0 + 1e-9)) {
-      const double start = cuts.back();
-      if (pending - start > 0.0 && pending - start >= config.min_section_length_m) {
-        cuts.push_back(pending);
-      } else {
-        cuts.push_back(start +
-                       (k - start) / std::ceil((k - start) / config.max_section_length_m - 1e-9));
-      }
-    }
-    pending = k;
-  };
-  for (const RadiusKnot& knot : landmark.profile) {
-    if (knot.s_m > s0 && knot.s_m < s1) advance(knot.s_m);
+// A cell of a landmark: where it was cut, and the number of its place.
+struct Cell {
+  double s0, s1;  // along the landmark's axis from its anchor, ascending
+  int index;
+};
+
+// Cuts the stretch [s0, s1] at multiples of the section length from the landmark's origin, ascending
+// in s. A rest at an end that is shorter than the least length joins its neighbour.
+std::vector<Cell> CutIntoCells(const Landmark& landmark,
+                               double s0,
+                               double s1,
+                               const TopologyState::Origin& origin,
+                               const TopologyConfig& config) {
+  // t runs along the origin's direction, whatever sign the axis has now.
+  const double sign = landmark.cylinder.axis.dot(origin.direction) < 0.0 ? -1.0 : 1.0;
+  const double length = config.max_section_length_m;
+  const double t_origin =
+      sign * (origin.point - landmark.cylinder.point).dot(landmark.cylinder.axis);
+  double t0 = sign * s0, t1 = sign * s1;
+  if (t0 > t1) std::swap(t0, t1);
+  // A cut within a hair of an end is the end.
+  constexpr double kHair = 1e-9;
+  const int first = static_cast<int>(std::floor((t0 - t_origin) / length + kHair));
+  const int last = std::max(
+      first, static_cast<int>(std::ceil((t1 - t_origin) / length - kHair)) - 1);
+  std::vector<Cell> cells;
+  for (int k = first; k <= last; ++k) {
+    const double low = k == first ? t0 : t_origin + k * length;
+    const double high = k == last ? t1 : t_origin + (k + 1) * length;
+    cells.push_back({low, high, k});
   }
-  advance(s1);
-  if (cuts.size() > 1 && s1 - cuts.back() < config.min_section_length_m) cuts.pop_back();
-  cuts.push_back(s1);
-  return cuts;
+  if (cells.size() > 1 && cells.front().s1 - cells.front().s0 < config.min_section_length_m) {
+    cells[1].s0 = cells[0].s0;
+    cells.erase(cells.begin());
+  }
+  if (cells.size() > 1 && cells.back().s1 - cells.back().s0 < config.min_section_length_m) {
+    cells[cells.size() - 2].s1 = cells.back().s1;
+    cells.pop_back();
+  }
+  if (sign < 0.0) {
+    for (Cell& cell : cells) cell = {-cell.s1, -cell.s0, cell.index};
+    std::reverse(cells.begin(), cells.end());
+  }
+  return cells;
 }
 
 double SigmaOfBlock(const Matrix5d& covariance, int first) {
@@ -598,6 +669,7 @@ MapCylinder InferredSection(const Vector3d& start,
 // A section with the key under which its id is kept.
 struct KeyedSection {
   std::pair<int, int> key;
+  int index;
   MapCylinder cylinder;
 };
 
@@ -612,7 +684,7 @@ void AddInferred(const std::pair<int, int>& key,
     part.start = (1.0 - f0) * whole.start + f0 * whole.end;
     part.end = (1.0 - f1) * whole.start + f1 * whole.end;
     part.radius_m = whole.radius_m + whole.taper_m_per_m * whole.Length() * (0.5 * (f0 + f1) - 0.5);
-    sections->push_back({key, part});
+    sections->push_back({key, i, part});
   }
 }
 
@@ -660,11 +732,6 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
   for (const Landmark& landmark : landmarks) alive.insert(landmark.id);
   for (auto it = state_.branch_of_landmark.begin(); it != state_.branch_of_landmark.end();) {
     it = alive.count(it->first) > 0 ? std::next(it) : state_.branch_of_landmark.erase(it);
-  }
-  for (auto it = state_.sections.begin(); it != state_.sections.end();) {
-    const bool keep = alive.count(it->first.first) > 0 &&
-                      (it->first.second < 0 || alive.count(it->first.second) > 0);
-    it = keep ? std::next(it) : state_.sections.erase(it);
   }
 
   // --- Roots: what could be a trunk, and what it costs to stand alone -------------------------
@@ -845,6 +912,17 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
   }
 
   // --- Cylinders ------------------------------------------------------------------------------
+  {
+    std::map<int, TopologyState::Origin> origins;
+    for (const Piece& piece : pieces) {
+      const int id = piece.landmark->id;
+      const auto it = state_.origins.find(id);
+      origins[id] = it != state_.origins.end()
+                        ? it->second
+                        : TopologyState::Origin{piece.end[0], piece.landmark->cylinder.axis};
+    }
+    state_.origins = std::move(origins);
+  }
   std::vector<std::vector<KeyedSection>> sections(n);
   for (const int c : sequence) {
     const Chain& chain = chains[c];
@@ -925,56 +1003,79 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
           trim(k + 1, true, -0.5 * along);
         }
       }
-      const std::vector<double> cuts =
-          SectionCuts(*piece.landmark, stretch[k][0], stretch[k][1], config_);
-      const int count = static_cast<int>(cuts.size()) - 1;
-      for (int i = 0; i < count; ++i) {
-        const int j = link.reversed ? count - 1 - i : i;
+      std::vector<Cell> cells = CutIntoCells(*piece.landmark,
+                                             stretch[k][0],
+                                             stretch[k][1],
+                                             state_.origins.at(piece.landmark->id),
+                                             config_);
+      if (link.reversed) std::reverse(cells.begin(), cells.end());
+      for (const Cell& cell : cells) {
         sections[c].push_back({{piece.landmark->id, piece.landmark->id},
-                               MeasuredSection(piece, cuts[j], cuts[j + 1], link.reversed)});
+                               cell.index,
+                               MeasuredSection(piece, cell.s0, cell.s1, link.reversed)});
       }
     }
   }
 
-  // --- Cylinder ids: a section keeps the id of the old one nearest to it ----------------------
+  // --- Cylinder ids: those of their places ----------------------------------------------------
   {
-    std::map<std::pair<int, int>, std::vector<MapCylinder*>> by_key;
+    using Places = std::map<std::pair<int, int>, std::vector<TopologyState::Section>>;
+    Places before = std::move(state_.sections), after;
+    std::vector<std::pair<int, KeyedSection*>> nameless;  // branch id, section
+    const auto keep = [&](int branch, const KeyedSection& section, int id) {
+      const MapCylinder& c = section.cylinder;
+      after[section.key].push_back({id, section.index, branch, 0.5 * (c.start + c.end)});
+    };
     for (const int c : sequence) {
       for (KeyedSection& section : sections[c]) {
         section.cylinder.id = -1;
-        by_key[section.key].push_back(&section.cylinder);
+        std::vector<TopologyState::Section>& places = before[section.key];
+        const auto it = std::find_if(places.begin(), places.end(), [&](const auto& place) {
+          return place.index == section.index;
+        });
+        if (it == places.end()) {
+          nameless.emplace_back(branch_id[c], &section);
+          continue;
+        }
+        section.cylinder.id = it->id;
+        keep(branch_id[c], section, it->id);
+        places.erase(it);
       }
     }
-    for (auto& [key, list] : by_key) {
-      const std::vector<TopologyState::Section> old = state_.sections[key];
-      std::vector<std::tuple<double, int, int>> pairs;
-      for (int i = 0; i < static_cast<int>(list.size()); ++i) {
-        const Vector3d middle = 0.5 * (list[i]->start + list[i]->end);
-        for (int k = 0; k < static_cast<int>(old.size()); ++k) {
-          const double distance = (old[k].middle - middle).norm();
-          if (distance < config_.max_section_length_m) pairs.emplace_back(distance, k, i);
+    // A place that another landmark (or a bridge) had on the same branch keeps its id.
+    std::vector<const TopologyState::Section*> free;
+    for (const auto& [key, places] : before) {
+      for (const TopologyState::Section& place : places) free.push_back(&place);
+    }
+    std::vector<std::tuple<double, int, std::size_t>> pairs;  // distance, id, section
+    for (std::size_t i = 0; i < nameless.size(); ++i) {
+      const MapCylinder& c = nameless[i].second->cylinder;
+      const Vector3d middle = 0.5 * (c.start + c.end);
+      for (const TopologyState::Section* place : free) {
+        const double distance = (place->middle - middle).norm();
+        if (place->branch_id == nameless[i].first && distance < config_.max_section_length_m) {
+          pairs.emplace_back(distance, place->id, i);
         }
       }
-      std::sort(pairs.begin(), pairs.end());
-      std::vector<bool> used(old.size(), false);
-      for (const auto& [distance, k, i] : pairs) {
-        if (used[k] || list[i]->id >= 0) continue;
-        used[k] = true;
-        list[i]->id = old[k].id;
+    }
+    std::sort(pairs.begin(), pairs.end());
+    std::set<int> taken;
+    for (const auto& [distance, id, i] : pairs) {
+      if (nameless[i].second->cylinder.id >= 0 || !taken.insert(id).second) continue;
+      nameless[i].second->cylinder.id = id;
+    }
+    for (const auto& [branch, section] : nameless) {
+      if (section->cylinder.id < 0) section->cylinder.id = state_.next_cylinder_id++;
+      keep(branch, *section, section->cylinder.id);
+    }
+    // Places that are not filled now but may be again: cells of landmarks that are still there.
+    for (const auto& [key, places] : before) {
+      if (key.first != key.second || state_.origins.count(key.first) == 0) continue;
+      for (const TopologyState::Section& place : places) {
+        if (taken.count(place.id) == 0) after[key].push_back(place);
       }
     }
-    for (const int c : sequence) {
-      for (KeyedSection& section : sections[c]) {
-        if (section.cylinder.id < 0) section.cylinder.id = state_.next_cylinder_id++;
-      }
-    }
-    for (auto& [key, list] : by_key) {
-      std::vector<TopologyState::Section>& target = state_.sections[key];
-      target.clear();
-      for (const MapCylinder* cylinder : list) {
-        target.push_back({cylinder->id, 0.5 * (cylinder->start + cylinder->end)});
-      }
-    }
+    state_.sections = std::move(after);
   }
 
   // --- Branches -------------------------------------------------------------------------------

@@ -5,7 +5,9 @@
 #include <string>
 
 #include "../topology/landmark_maker.h"
+#include "dendro_slam/geometry/cylinder.h"
 #include "dendro_slam/io/map_directory.h"
+#include "dendro_slam/topology/crown.h"
 
 int main(int argc, char** argv) {
   using namespace dendro;
@@ -35,7 +37,7 @@ int main(int argc, char** argv) {
     files.landmarks.back().id = 60;
     files.landmarks.push_back(MakeLandmark(99, {4, -4, 4}, {5, -4, 4.2}, 0.02, 0.02));
   } else if (kind == "one") {
-    files.landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 0.4}, 0.1, 0.1)};
+    files.landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 0.2}, 0.1, 0.1)};
   } else if (kind == "big") {
     for (int i = 0; i < 240; ++i) add_tree(8.0 * (i % 16), 8.0 * (i / 16), 10);
   } else if (kind != "empty") {
@@ -55,6 +57,38 @@ int main(int argc, char** argv) {
     pose.T_map_lidar.translation() = Eigen::Vector3d(4.0, -2.0 + 0.1 * i, 1.5);
     files.trajectory.push_back(pose);
   }
+  // Twenty points on every cylinder, and a crown of leaves half a metre round every branch's tip.
+  const auto add_point = [&](const Eigen::Vector3d& position, Label label) {
+    files.points.emplace_back();
+    files.points.back().position = position;
+    files.points.back().label = label;
+  };
+  if (kind == "small" || kind == "big") {
+    for (const MapCylinder& c : files.model.cylinders) {
+      const auto basis = PerpendicularBasis(c.Axis());
+      for (int i = 0; i < 20; ++i) {
+        const double f = (i + 0.5) / 20.0, angle = 2.4 * i;
+        const double radius = c.radius_m + (f - 0.5) * c.taper_m_per_m * c.Length();
+        add_point(c.start + f * (c.end - c.start) +
+                      radius * (basis.col(0) * std::cos(angle) + basis.col(1) * std::sin(angle)),
+                  Label::kWood);
+      }
+    }
+  }
+  if (kind == "small") {
+    for (const MapBranch& b : files.model.branches) {
+      if (b.order == 0 || b.tree_id < 0) continue;
+      for (int i = 0; i < 500; ++i) {
+        const double z = 1.0 - 2.0 * (i + 0.5) / 500.0, angle = 2.399963 * i;
+        const double r = std::sqrt(1.0 - z * z);
+        const double depth = 0.5 * std::cbrt(((7 * i) % 500 + 0.5) / 500.0);
+        add_point(b.tip + depth * Eigen::Vector3d(r * std::cos(angle), r * std::sin(angle), z),
+                  Label::kLeaf);
+      }
+    }
+  }
+  AssignPoints(files.model, 0.06, 1.0, &files.points);
+  MeasureCrowns(files.points, 0.5, &files.model);
   try {
     SaveMap(argv[1], files);
   } catch (const std::exception& error) {

@@ -209,14 +209,18 @@ TEST_F(Directory, TablesByHand) {
   tree.dbh_m = 0.3;
   tree.dbh_sigma_m = 0.002;
   tree.height_m = 7.5;
+  tree.dbh_status = FitStatus::kMeasured;
+  tree.crown = MapCrown{12.5, 9.0, 14.0, 10.0, 1.5, 6.0, 0.5, 77};
   model.trees = {tree, tree};
   model.trees[1].dbh_m.reset();
+  model.trees[1].dbh_status = FitStatus::kUnresolved;
+  model.trees[1].crown.reset();
   EXPECT_THAT(
       TreesCsv(model),
       AllOf(HasSubstr("\n1,0.000000,0.000000,0.000000,0.300000,0.002000,1.3000,7.500000,2,0,"),
             HasSubstr(",,,1.3000,7.500000,2,0,"),
-            HasSubstr(",MEASURED\n"),
-            HasSubstr(",UNRESOLVED\n")));
+            HasSubstr(",12.500000,9.000000,1.500000,6.000000,0.500000,77,MEASURED\n"),
+            HasSubstr(",0,,,,,,,UNRESOLVED\n")));
   StampedPose pose;
   pose.stamp_ns = 5;
   EXPECT_EQ(TrajectoryTum({pose}),
@@ -265,6 +269,42 @@ TEST_F(Directory, TheGeoreferenceIsSavedAndExportedWithTheTrees) {
   EXPECT_FALSE(again.georeference->heading_deg.has_value());
   EXPECT_FALSE(again.georeference->origin.altitude_m.has_value());
   EXPECT_EQ(again.georeference->note, g.note);
+}
+
+TEST_F(Directory, PointsAreKeptAndBelongToTheirMap) {
+  MapFiles files = SomeMap();
+  CloudPoint wood, leaf;
+  wood.position = Vector3d(1.5, -2.25, 3.0000001);
+  wood.tree_id = 4;
+  wood.branch_id = 9;
+  leaf.position = Vector3d(0, 0, 7);
+  leaf.label = Label::kLeaf;
+  files.points = {wood, leaf};
+  SaveMap(map_, files);
+  const MapFiles loaded = LoadMap(map_);
+  ASSERT_EQ(loaded.points.size(), 2U);
+  EXPECT_EQ(loaded.points[0].position, wood.position);
+  EXPECT_EQ(loaded.points[0].tree_id, 4);
+  EXPECT_EQ(loaded.points[0].branch_id, 9);
+  EXPECT_EQ(loaded.points[1].label, Label::kLeaf);
+  EXPECT_EQ(loaded.points[1].tree_id, -1);
+  const std::string whole = Read("points.ply");
+  const auto refused = [&](const std::string& content) {
+    WriteFileAtomically((map_ + "/points.ply"), content);
+    EXPECT_THROW(LoadMap(map_), MapFileError) << content.size();
+  };
+  refused("");
+  refused(whole.substr(0, whole.size() - 1));
+  refused(whole + "x");
+  refused("ply\nformat ascii 1.0\nelement vertex 99999999999999999999\n");
+  std::string label = whole;
+  label[whole.size() - 9] = 1;  // ground
+  refused(label);
+  // A map without points removes those of the map before.
+  files.points.clear();
+  SaveMap(map_, files);
+  EXPECT_TRUE(LoadMap(map_).points.empty());
+  EXPECT_FALSE(std::filesystem::exists(map_ + "/points.ply"));
 }
 
 TEST_F(Directory, EmptyMap) {

@@ -1,13 +1,19 @@
 """export_map: every format is read back by an independent reader and agrees with the map's own tables."""
 
 import csv
+import json
 import math
 import os
 import subprocess
+import sys
 
 import numpy as np
 import pytest
 import scipy.io
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+
+import oracles  # noqa: E402
 
 BUILD = os.environ.get("DENDRO_BUILD_DIR") or os.path.join(
     os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "build")
@@ -219,6 +225,127 @@ def test_ply(maps, tmp_path, fmt):
     assert len(np.unique(colors, axis=0)) >= 2
     if fmt == "ply-branch":
         assert (maps / "small" / "tree.ply").read_bytes() == (tmp_path / "m.ply").read_bytes()
+
+
+POINTS = np.dtype([("p", "<f8", 3), ("label", "u1"), ("tree", "<i4"), ("branch", "<i4")])
+
+
+def read_points(path):
+    """ply-points, by a reader of its own."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + 11
+    header = data[:end].decode().splitlines()
+    assert [h.split()[-1] for h in header if h.startswith("property")] == [
+        "x", "y", "z", "label", "tree_id", "branch_id"]
+    n = int(next(h for h in header if h.startswith("element vertex")).split()[2])
+    assert len(data) == end + n * POINTS.itemsize
+    return np.frombuffer(data, POINTS, n, end)
+
+
+@pytest.mark.parametrize("kind", ["small", "one", "empty", "big"])
+def test_las_and_ply_points(maps, tmp_path, kind):
+    export(maps / kind, "ply-points", tmp_path / "p.ply")
+    points = read_points(tmp_path / "p.ply")
+    cylinders = table(maps / kind, "cylinders.csv")
+    expected = {"small": 20 * len(cylinders) + 500 * 7, "big": 20 * len(cylinders)}.get(kind, 0)
+    assert len(points) == expected
+    if kind == "small":
+        # Wood points lie on their branch's surface; every branch has its twenty per cylinder.
+        wood = points[points["label"] == 2]
+        of_branch = {b: (wood["branch"] == b).sum() for b in np.unique(wood["branch"])}
+        assert -1 not in of_branch
+        for branch in {int(r["branch_id"]) for r in cylinders}:
+            count = 20 * sum(int(r["branch_id"]) == branch for r in cylinders)
+            assert of_branch[branch] == pytest.approx(count, abs=0.1 * count + 4)
+        # What hangs on no tree has a branch but no tree.
+        loose = {int(r["branch_id"]) for r in cylinders if r["tree_id"] == ""}
+        assert loose and all((wood["tree"][wood["branch"] == b] == -1).all() for b in loose)
+        leaves = points[points["label"] == 3]
+        assert len(leaves) == 3500 and (leaves["branch"] == -1).all() and set(leaves["tree"]) == {0, 1}
+    laspy = oracles.require("laspy")
+    export(maps / kind, "las", tmp_path / "p.las")
+    las = laspy.read(tmp_path / "p.las")
+    assert str(las.header.version) == "1.4" and las.header.point_format.id == 6
+    assert las.header.point_count == len(las.points) == len(points)
+    assert np.allclose(las.xyz.reshape(-1, 3), points["p"], atol=0.51e-4)
+    assert np.array_equal(las["tree_id"], points["tree"])
+    assert np.array_equal(las["branch_id"], points["branch"])
+    assert np.array_equal(np.asarray(las.classification), np.where(points["label"] == 2, 64, 5))
+    if len(points):
+        assert np.allclose(las.header.maxs, points["p"].max(axis=0), atol=1e-3)
+        assert np.allclose(las.header.mins, points["p"].min(axis=0), atol=1e-3)
+    assert las.header.number_of_points_by_return[0] == len(points)
+
+
+def metres_between(a, b):
+    """East and north from a to b (longitude, latitude), by the geodesic's chord: both to ECEF and back."""
+    def ecef(longitude, latitude):
+        e2, lo, la = 6.69437999014e-3, math.radians(longitude), math.radians(latitude)
+        n = 6378137.0 / math.sqrt(1 - e2 * math.sin(la) ** 2)
+        return np.array([n * math.cos(la) * math.cos(lo), n * math.cos(la) * math.sin(lo), n * (1 - e2) * math.sin(la)])
+    lo, la = math.radians(a[0]), math.radians(a[1])
+    d = ecef(*b[:2]) - ecef(*a[:2])
+    return (d @ [-math.sin(lo), math.cos(lo), 0],
+            d @ [-math.sin(la) * math.cos(lo), -math.sin(la) * math.sin(lo), math.cos(la)])
+
+
+@pytest.mark.parametrize("kind", ["small", "one", "empty", "big"])
+def test_geojson(maps, tmp_path, kind):
+    # The map's x axis points 30 degrees east of north.
+    export(maps / kind, "geojson", tmp_path / "m.json", "--georeference", "33.4214,-111.9280,30,350")
+    with open(tmp_path / "m.json") as stream:
+        document = json.load(stream)
+    assert document["type"] == "FeatureCollection"
+    trees = [f for f in document["features"] if f["geometry"]["type"] == "Point"]
+    branches = [f for f in document["features"] if f["geometry"]["type"] == "LineString"]
+    ours = table(maps / kind, "trees.csv")
+    assert len(trees) == len(ours) and len(branches) == len(table(maps / kind, "branches.csv"))
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    for feature, row in zip(trees, ours):
+        x, y, z = (float(row[a]) for a in "xyz")
+        east, north = metres_between((-111.9280, 33.4214), feature["geometry"]["coordinates"])
+        # x runs 30 degrees east of north, y is to the left of it: 60 degrees west of north.
+        assert east == pytest.approx(x * s - y * c, abs=0.01)
+        assert north == pytest.approx(x * c + y * s, abs=0.01)
+        assert feature["geometry"]["coordinates"][2] == pytest.approx(350 + z, abs=1e-3)
+        assert str(feature["properties"]["tree_id"]) == row["tree_id"]
+        assert feature["properties"]["dbh_m"] == pytest.approx(float(row["dbh_m"] or "nan"), abs=1e-6) \
+            or not row["dbh_m"]
+    cylinders = table(maps / kind, "cylinders.csv")
+    for feature in branches:
+        own = [r for r in cylinders if int(r["branch_id"]) == feature["properties"]["branch_id"]]
+        assert len(feature["geometry"]["coordinates"]) == len(own) + 1
+        assert feature["properties"]["tree_id"] == (int(own[0]["tree_id"]) if own[0]["tree_id"] else None)
+
+
+def test_geojson_needs_a_place(maps, tmp_path):
+    assert "--georeference" in export(maps / "one", "geojson", tmp_path / "m.json", expect=2)
+    message = export(maps / "one", "geojson", tmp_path / "m.json", "--georeference", "91,0,0", expect=2)
+    assert "latitude_deg" in message and message.count("\n") == 1
+
+
+def test_crown_columns(maps):
+    trees = table(maps / "small", "trees.csv")
+    for tree, spheres in zip(trees, (5, 2)):
+        # Half-metre balls of leaves round the branches' tips, some of which touch.
+        assert 0.3 * spheres < float(tree["crown_volume_m3"]) < 0.524 * spheres
+        assert 0 < float(tree["crown_base_height_m"]) < float(tree["crown_top_height_m"]) < 6
+        assert int(tree["crown_points"]) == 500 * spheres
+    assert all(r["crown_volume_m3"] == "" for r in table(maps / "big", "trees.csv"))
+
+
+def test_branches_and_trees_say_what_they_know(maps):
+    cylinders = {r["cylinder_id"]: r for r in table(maps / "small", "cylinders.csv")}
+    for branch in table(maps / "small", "branches.csv"):
+        own = sorted((c for c in cylinders.values() if c["branch_id"] == branch["branch_id"]),
+                     key=lambda c: int(c["position_in_branch"]))
+        assert branch["base_status"] == own[0]["status"] and branch["tip_status"] == own[-1]["status"]
+        inferred = sum(float(c["length_m"]) for c in own if c["status"] == "INFERRED")
+        assert float(branch["inferred_length_m"]) == pytest.approx(inferred, abs=1e-5)
+        assert float(branch["tip_diameter_sigma_m"]) == pytest.approx(2 * float(own[-1]["radius_sigma_m"]),
+                                                                      abs=2e-6)
+        assert float(branch["visible_arc_deg"]) == 180.0 and branch["num_scans"] == "10"
+    assert {r["status"] for r in table(maps / "small", "trees.csv")} == {"MEASURED"}
 
 
 def test_one_cylinder_and_none(maps, tmp_path):

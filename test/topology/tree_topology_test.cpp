@@ -234,6 +234,95 @@ TEST(TreeTopology, IdsStayWhileTheMapGrows) {
   }
 }
 
+// Id and middle of every cylinder of a landmark.
+std::map<int, Vector3d> Places(const TreeModel& model, int landmark_id) {
+  std::map<int, Vector3d> places;
+  for (const MapCylinder& c : model.cylinders) {
+    if (c.landmark_id == landmark_id) places[c.id] = 0.5 * (c.start + c.end);
+  }
+  return places;
+}
+
+TEST(TreeTopology, CylindersKeepTheirPlacesAndIdsWhenKnotsMoveAndEndsGrow) {
+  TreeTopology topology{TopologyConfig()};
+  const auto trunk = [](double z0, double z1, double knot_m, bool flipped = false) {
+    Landmark landmark = flipped ? MakeLandmark(3, {0, 0, z1}, {0, 0, z0}, 0.1, 0.15, 0.002, knot_m)
+                                : MakeLandmark(3, {0, 0, z0}, {0, 0, z1}, 0.15, 0.1, 0.002, knot_m);
+    return std::vector<Landmark>{landmark};
+  };
+  const std::map<int, Vector3d> first = Places(topology.Build(trunk(0.4, 3.15, 0.25), 0), 3);
+  ASSERT_EQ(first.size(), 11U);  // every 25 cm
+  // Other knots, and the axis the other way round: nothing moves.
+  for (const double knot_m : {0.19, 0.31, 0.5, 0.11}) {
+    for (const bool flipped : {false, true}) {
+      const auto places = Places(topology.Build(trunk(0.4, 3.15, knot_m, flipped), 1), 3);
+      ASSERT_EQ(places.size(), first.size());
+      for (const auto& [id, middle] : first) {
+        ASSERT_EQ(places.count(id), 1U);
+        EXPECT_LT((places.at(id) - middle).norm(), 1e-9);
+      }
+    }
+  }
+  // Ends that grow, by less than a cell and by more: the inner cylinders stay where they are.
+  for (const auto& [z0, z1] : {std::pair{0.37, 3.2}, {0.1, 3.9}, {-0.9, 4.3}}) {
+    const auto places = Places(topology.Build(trunk(z0, z1, 0.25), 2), 3);
+    EXPECT_GE(places.size(), first.size());
+    for (const auto& [id, middle] : first) {
+      ASSERT_EQ(places.count(id), 1U) << z0;
+      EXPECT_LT((places.at(id) - middle).norm(), 0.1) << z0;
+    }
+  }
+  // An end that comes back finds its ids again.
+  const auto grown = Places(topology.Build(trunk(-0.9, 4.3, 0.25), 3), 3);
+  topology.Build(trunk(0.4, 3.15, 0.25), 4);
+  EXPECT_EQ(Places(topology.Build(trunk(-0.9, 4.3, 0.25), 5), 3), grown);
+}
+
+TEST(TreeTopology, ALandmarkThatTakesAPlaceOverTakesItsIdsOver) {
+  TreeTopology topology{TopologyConfig()};
+  const Landmark low = MakeLandmark(1, {0, 0, 0}, {0, 0, 2}, 0.15, 0.12);
+  const Landmark high = MakeLandmark(2, {0, 0, 2.3}, {0, 0, 4.3}, 0.12, 0.1);
+  const TreeModel before = topology.Build({low, high}, 0);
+  ASSERT_EQ(before.branches.size(), 1U);
+  // The two turn out to be one; the gap between them was seen meanwhile.
+  const TreeModel after = topology.Build({MakeLandmark(1, {0, 0, 0}, {0, 0, 4.3}, 0.15, 0.1)}, 1);
+  ASSERT_EQ(after.branches.size(), 1U);
+  int kept = 0;
+  for (const MapCylinder& c : after.cylinders) {
+    for (const MapCylinder& old : before.cylinders) {
+      if (old.id != c.id) continue;
+      ++kept;
+      EXPECT_LT((0.5 * (old.start + old.end - c.start - c.end)).norm(), 0.25);
+    }
+  }
+  EXPECT_GE(kept, static_cast<int>(before.cylinders.size()) - 1);
+  std::set<int> ids;
+  for (const MapCylinder& c : after.cylinders) EXPECT_TRUE(ids.insert(c.id).second);
+}
+
+TEST(TreeTopology, OneBranchSeenTwiceIsOne) {
+  const Landmark trunk = MakeLandmark(0, {0, 0, 0}, {0, 0, 5}, 0.15, 0.12);
+  const Landmark branch = MakeLandmark(1, {0.2, 0, 3}, {2.0, 0, 3.4}, 0.04, 0.03);
+  // The same again, 3 cm and 3 degrees off, shorter and seen less; and the trunk's upper half.
+  Landmark again = MakeLandmark(2, {0.5, 0.03, 3.05}, {1.9, 0.05, 3.4}, 0.045, 0.035);
+  again.num_scans = 3;
+  Landmark top = MakeLandmark(3, {0.04, 0, 2.4}, {0.02, 0, 4.9}, 0.1, 0.09);
+  top.num_scans = 4;
+  // A neighbour that runs beside the branch without touching it.
+  const Landmark beside = MakeLandmark(4, {0.2, 0.09, 3}, {2.0, 0.1, 3.4}, 0.04, 0.03);
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build({again, top, branch, trunk, beside}, 0);
+  ExpectConsistent(model);
+  std::set<int> landmarks;
+  for (const MapCylinder& c : model.cylinders) landmarks.insert(c.landmark_id);
+  landmarks.erase(-1);
+  EXPECT_EQ(landmarks, (std::set<int>{0, 1, 4}));
+  EXPECT_EQ(model.branches.size(), 3U);
+  // When the one that stood in its place is gone, the other comes back.
+  const TreeModel later = topology.Build({again, trunk}, 1);
+  EXPECT_EQ(later.branches.size(), 2U);
+}
+
 TEST(TreeTopology, OppositeBranchesOfATrunkAreTwo) {
   // Horizontal, at the same height: each looks like the continuation of the other.
   const std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 4}, 0.15, 0.12),

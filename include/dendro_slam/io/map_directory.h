@@ -19,6 +19,7 @@
 #include "dendro_slam/mapping/tree_model.h"
 #include "dendro_slam/odometry/relative_motion.h"
 #include "dendro_slam/range_image/range_image.h"
+#include "dendro_slam/topology/map_cloud.h"
 #include "dendro_slam/topology/tree_topology.h"
 
 namespace dendro {
@@ -38,13 +39,15 @@ struct MapFiles {
   int next_landmark_id = 0;
   TopologyState topology;
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.
+  std::vector<CloudPoint> points;       ///< Empty unless they were gathered (MapCloud).
   std::string frame = "map";
   std::optional<Georeference> georeference;  ///< Where the map lies on the earth, if there were fixes.
   std::map<std::string, std::string> config;  ///< "section/key" to value, as the run used it.
 };
 
 /// Writes `tree_map.json`, `cylinders.csv`, `branches.csv`, `trees.csv`, `trajectory.tum`,
-/// `tree.ply` and, with a timer, `timing.json` into `directory` (made if missing).
+/// `tree.ply`, with points `points.ply` and, with a timer, `timing.json` into `directory` (made if
+/// missing).
 ///
 /// Every file is first written completely under a temporary name in the same directory and synced
 /// to disk; only when all are there are they renamed, tree_map.json last. If anything fails (disk
@@ -55,7 +58,7 @@ void SaveMap(const std::string& directory,
              const MapFiles& files,
              const StageTimer* timer = nullptr);
 
-/// Reads a map directory's `tree_map.json` (which alone holds the map) and its trajectory.
+/// Reads a map directory's `tree_map.json` (which alone holds the map), its trajectory and its points.
 /// @throws MapFileError  One line: file, field and what is wrong (missing, wrong type, not finite,
 ///                       a newer format than this program knows).
 MapFiles LoadMap(const std::string& directory);

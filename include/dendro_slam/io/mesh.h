@@ -39,11 +39,19 @@ double EndRadius(const MapCylinder& cylinder);
 
 /// The closed surface of one cylinder as a frustum, appended to a mesh.
 /// @param sides  Number of sides of its polygon, >= 3.
-void AppendFrustum(const MapCylinder& cylinder, const Rgb& color, int sides, Mesh* mesh);
+/// @param caps  False: the mantle only, for frusta whose ends touch others.
+void AppendFrustum(
+    const MapCylinder& cylinder, const Rgb& color, int sides, Mesh* mesh, bool caps = true);
 
 /// Every cylinder of the model (or of one tree; -1 for what is attached to none).
 Mesh ModelMesh(const TreeModel& model, MeshColor scheme, int sides = 12);
-Mesh TreeMesh(const TreeModel& model, int tree_id, MeshColor scheme, int sides = 12);
+/// @param inner_caps  False: no caps where one cylinder of a branch touches the next; they cannot be
+///                    seen.
+Mesh TreeMesh(const TreeModel& model,
+              int tree_id,
+              MeshColor scheme,
+              int sides = 12,
+              bool inner_caps = true);
 
 /// The mesh as a binary little-endian PLY file's content: vertices (float x y z, uchar red green
 /// blue), faces.

@@ -20,6 +20,7 @@
 #include "dendro_slam/segmentation/ground_plane.h"
 #include "dendro_slam/segmentation/wood_segmenter.h"
 #include "dendro_slam/sensors/pose_buffer.h"
+#include "dendro_slam/topology/map_cloud.h"
 #include "dendro_slam/topology/tree_topology.h"
 
 namespace dendro {
@@ -46,6 +47,7 @@ struct TreeMappingConfig {
   double odometry_timeout_s = 0.5;  ///< Scans go on without odometry after this silence [s]. > 0.
   MapperConfig mapper;
   TopologyConfig topology;
+  MapCloudConfig map_cloud;
   PoseBufferConfig pose_buffer;
   GeoreferencerConfig georeference;
 
@@ -55,6 +57,7 @@ struct TreeMappingConfig {
     v("odometry_timeout_s", odometry_timeout_s);
     v("mapper", mapper);
     v("topology", topology);
+    v("map_cloud", map_cloud);
     v("pose_buffer", pose_buffer);
     v("georeference", georeference);
   }
@@ -121,12 +124,17 @@ class TreeMappingStage {
   ///                without it, the base is the lowest wood seen.
   MapperResult Process(const MapperInput& input, const std::optional<GroundPlane>& ground);
 
+  /// Takes the returns of a scan that Process has taken, where `map_cloud` is enabled; does nothing
+  /// otherwise, and while a loaded map is not found again.
+  void AddPoints(const LabelledScan& scan, const Eigen::Isometry3d& T_map_lidar);
+
   /// The map at the last key frame. Landmarks between key frames change in their extents and radii
   /// only; Files() has them.
   const TreeModel& model() const { return model_; }
   const Mapper& mapper() const { return mapper_; }
 
-  /// Everything a map directory holds, of this moment.
+  /// Everything a map directory holds, of this moment; with `map_cloud` also the points and the
+  /// crowns that they show.
   /// @param config  The settings to keep with the map, see DescribeConfig.
   MapFiles Files(const std::map<std::string, std::string>& config);
 
@@ -147,6 +155,7 @@ class TreeMappingStage {
 
   Mapper mapper_;
   TreeTopology topology_;
+  MapCloud cloud_;
   TreeModel model_;
   Georeferencer georeferencer_;
   std::optional<Georeference> loaded_georeference_;

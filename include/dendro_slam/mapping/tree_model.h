@@ -55,6 +55,18 @@ struct MapBranch {
   double height_m = 0.0;               ///< Of the base above the tree's base.
 };
 
+/// A crown as its leaf returns show it (MeasureCrown).
+struct MapCrown {
+  double volume_m3 = 0.0;              ///< Of the alpha shape.
+  double projected_area_m2 = 0.0;      ///< Of the alpha shape seen from above.
+  double hull_volume_m3 = 0.0;         ///< Of the convex hull.
+  double hull_area_m2 = 0.0;           ///< Of the convex hull seen from above.
+  double base_height_m = 0.0;          ///< Lowest leaves above the tree's base.
+  double top_height_m = 0.0;           ///< Highest leaves above the tree's base.
+  double alpha_m = 0.0;                ///< Radius of the alpha shape.
+  int num_points = 0;                  ///< Leaf points, one per voxel.
+};
+
 /// A tree: a trunk and what is attached to it.
 struct MapTree {
   int id = 0;
@@ -64,6 +76,7 @@ struct MapTree {
   double dbh_height_m = 1.3;
   std::optional<double> dbh_m;         ///< Diameter at breast height; absent when not seen.
   double dbh_sigma_m = 0.0;
+  FitStatus dbh_status = FitStatus::kUnresolved;  ///< kInferred: between places that were seen.
   double height_m = 0.0;               ///< Highest wood seen above the base.
   int max_branch_order = 0;
   double stem_volume_m3 = 0.0;
@@ -73,6 +86,7 @@ struct MapTree {
   double lean_rad = 0.0;
   double arc_coverage_rad = 0.0;
   int num_scans = 0;
+  std::optional<MapCrown> crown;       ///< Absent without leaf returns (map_cloud/enabled).
 };
 
 /// Everything the map says at one time.

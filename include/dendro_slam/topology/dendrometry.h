@@ -17,6 +17,24 @@ struct StemDiameter {
   FitStatus status = FitStatus::kMeasured;  ///< kInferred where it lies in a bridged gap.
 };
 
+/// Diameter of a branch at one place.
+struct BranchDiameter {
+  double diameter_m = 0.0;
+  double sigma_m = 0.0;                     ///< Standard deviation of the diameter [m].
+  FitStatus status = FitStatus::kInferred;  ///< Of the cylinder that lies there.
+};
+
+/// What the cylinders of a branch tell beside MapBranch.
+struct BranchMeasures {
+  BranchDiameter base, middle, tip;
+  double visible_arc_rad = 0.0;    ///< Least of the measured cylinders.
+  int num_scans = 0;               ///< Most of the measured cylinders.
+  double inferred_length_m = 0.0;  ///< Bridged, not seen.
+};
+
+/// @throws std::out_of_range  If the branch names a cylinder that the model does not hold.
+BranchMeasures MeasureBranch(const TreeModel& model, const MapBranch& branch);
+
 /// Wood volume with its uncertainty.
 struct WoodVolume {
   double volume_m3 = 0.0;

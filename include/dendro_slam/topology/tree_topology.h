@@ -16,8 +16,8 @@ namespace dendro {
 
 /// Parameters of the step from landmarks to branches and trees.
 struct TopologyConfig {
-  double max_section_length_m = 0.5;  ///< Longest cylinder of the map [m]. > 0.
-  double min_section_length_m = 0.1;  ///< Radius knots closer than this share a section [m]. >= 0.
+  double max_section_length_m = 0.25;  ///< Length of the map's cylinders [m]. > 0.
+  double min_section_length_m = 0.1;   ///< A shorter rest at an end joins its neighbour [m]. >= 0.
   double join_gap_m = 1.0;            ///< Longest unseen gap that one branch may bridge [m]. >= 0.
   double join_angle_deg = 30.0;       ///< Largest bend between two pieces of one branch [deg].
   double join_offset_m = 0.06;        ///< Sideways miss allowed beside radius and bend [m]. >= 0.
@@ -56,16 +56,24 @@ struct TopologyConfig {
 
 /// What keeps the ids of a map in place from one update to the next and over save and load.
 struct TopologyState {
-  /// Where a cylinder was when it got its id.
+  /// A cylinder's place and its id.
   struct Section {
     int id = 0;
-    Eigen::Vector3d middle = Eigen::Vector3d::Zero();  ///< [m], map frame.
+    int index = 0;       ///< Cell along the landmark from its origin, or part of the bridge.
+    int branch_id = -1;  ///< Branch it was on when last seen.
+    Eigen::Vector3d middle = Eigen::Vector3d::Zero();  ///< Where it was last seen [m], map frame.
+  };
+  /// Where the cells of a landmark are counted from, and which way.
+  struct Origin {
+    Eigen::Vector3d point = Eigen::Vector3d::Zero();      ///< [m], map frame.
+    Eigen::Vector3d direction = Eigen::Vector3d::UnitZ();
   };
   std::map<int, int> branch_of_landmark;  ///< Landmark id to branch id.
   std::map<int, int> tree_of_branch;      ///< Trunk's branch id to tree id.
   /// Sections of a landmark (id, id), of the gap between two (lower id, higher id), or of the
   /// stretch between a landmark and its parent's axis (id, -1).
   std::map<std::pair<int, int>, std::vector<Section>> sections;
+  std::map<int, Origin> origins;  ///< By landmark id.
   int next_branch_id = 0;
   int next_tree_id = 0;
   int next_cylinder_id = 0;
@@ -80,8 +88,10 @@ struct TopologyState {
 /// The trunk of a tree is the root that this leaves: steep, thick and low wood is cheap as a root,
 /// anything else is dear. Pieces that reach nothing keep tree_id -1.
 ///
-/// Ids are stable: a landmark stays with its branch, a branch with its tree, a cylinder with its
-/// place. Cost: quadratic in the number of landmarks with a small constant; not thread-safe.
+/// Ids are stable: a landmark stays with its branch, a branch with its tree. Cylinders are cut at
+/// places that do not move: every `max_section_length_m` along a landmark from where it was first
+/// seen, whatever its ends and its radius profile do later; a cylinder's id belongs to that place,
+/// and another landmark that takes the place over on the same branch takes the id over. Cost: quadratic in the number of landmarks with a small constant; not thread-safe.
 ///
 /// @note Deviates: the thesis stops at single cylinders and has no topology.
 class TreeTopology {
