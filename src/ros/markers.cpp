@@ -6,7 +6,9 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <iterator>
 #include <set>
+#include <utility>
 
 #include "dendro_slam/ros/conversions.h"
 
@@ -202,56 +204,283 @@ visualization_msgs::MarkerArray ScanCylinderMarkers(
   return markers;
 }
 
+namespace {
+
+/// Sides of a cylinder so that all of them stay below a number of triangles.
+int SidesFor(std::size_t cylinders, int max_triangles) {
+  constexpr int kMinSides = 6;
+  const double each = 0.5 * max_triangles / static_cast<double>(std::max<std::size_t>(cylinders, 1));
+  return std::clamp(static_cast<int>(each), kMinSides, kSides);
+}
+
+struct Label {
+  std::string text;
+  Eigen::Vector3d anchor = Eigen::Vector3d::Zero();  ///< What it names.
+  int id = 0;
+};
+
+/// Heights in steps of a label's own, each given once.
+class LabelHeights {
+ public:
+  explicit LabelHeights(double step_m) : step_m_(step_m) {}
+
+  /// The free height nearest to the wanted one, if it is not too far off.
+  std::optional<double> Take(double wanted_m) {
+    constexpr int kFarthest = 6;
+    const int middle = static_cast<int>(std::lround(wanted_m / step_m_));
+    for (int off = 0; off <= kFarthest; ++off) {
+      for (const int slot : {middle + off, middle - off}) {
+        if (taken_.insert(slot).second) return slot * step_m_;
+      }
+    }
+    return std::nullopt;
+  }
+
+ private:
+  double step_m_;
+  std::set<int> taken_;
+};
+
+/// The labels of a tree (-1: of what is attached to none), the most important first.
+std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id) {
+  std::vector<const dendro::MapBranch*> branches;
+  for (const dendro::MapBranch& branch : model.branches) {
+    if (branch.tree_id == tree_id) branches.push_back(&branch);
+  }
+  std::stable_sort(branches.begin(), branches.end(), [](const auto* a, const auto* b) {
+    return std::make_pair(a->order, -a->base_radius_m) < std::make_pair(b->order, -b->base_radius_m);
+  });
+  std::vector<Label> labels;
+  for (const dendro::MapBranch* branch : branches) {
+    Label label;
+    label.id = branch->id;
+    const auto tree = std::find_if(model.trees.begin(), model.trees.end(), [&](const auto& t) {
+      return t.trunk_branch_id == branch->id;
+    });
+    if (tree != model.trees.end() && tree->dbh_m) {
+      label.anchor = tree->base + Eigen::Vector3d::UnitZ() * tree->dbh_height_m;
+      label.text = fmt::format("tree {}: DBH {:.1f} \u00b1 {:.1f} cm",
+                               tree->id,
+                               100.0 * *tree->dbh_m,
+                               100.0 * tree->dbh_sigma_m);
+    } else {
+      label.anchor = 0.5 * (branch->base + branch->tip);
+      label.text = fmt::format("b{}: {:.1f} \u00b1 {:.1f} cm",
+                               branch->id,
+                               100.0 * branch->base_radius_m,
+                               100.0 * branch->base_radius_sigma_m);
+    }
+    labels.push_back(std::move(label));
+  }
+  return labels;
+}
+
+void AppendLabels(const dendro::TreeModel& model,
+                  int tree_id,
+                  const MapMarkerStyle& style,
+                  const std::string& frame_id,
+                  visualization_msgs::MarkerArray* markers) {
+  constexpr double kStep = 1.25;        // of a label's height
+  constexpr double kOutward = 3.0;      // of a label's height
+  constexpr double kLeaderWidthM = 0.006;
+  const std_msgs::ColorRGBA soft = ToColor({200, 200, 200}, 0.8F);
+  visualization_msgs::Marker leaders = MakeMarker(model.stamp_ns,
+                                                  frame_id,
+                                                  "label_lines",
+                                                  tree_id + 1,
+                                                  visualization_msgs::Marker::LINE_LIST);
+  leaders.scale.x = kLeaderWidthM;
+  leaders.color = soft;
+  LabelHeights heights(kStep * style.label_height_m);
+  Eigen::Vector2d axis = Eigen::Vector2d::Zero();
+  for (const dendro::MapTree& tree : model.trees) {
+    if (tree.id == tree_id) axis = tree.base.head<2>();
+  }
+  for (const Label& label : LabelsOf(model, tree_id)) {
+    const std::optional<double> height = heights.Take(label.anchor.z() + style.label_height_m);
+    if (!height) continue;
+    // Out of the crown's middle, where the letters would stand in the wood.
+    Eigen::Vector3d at = label.anchor;
+    const Eigen::Vector2d outward = label.anchor.head<2>() - axis;
+    if (outward.norm() > 1e-3) {
+      at.head<2>() += kOutward * style.label_height_m * outward.normalized();
+    }
+    at.z() = *height;
+    visualization_msgs::Marker text = MakeMarker(model.stamp_ns,
+                                                 frame_id,
+                                                 "labels",
+                                                 label.id,
+                                                 visualization_msgs::Marker::TEXT_VIEW_FACING);
+    text.scale.z = style.label_height_m;
+    text.pose.position = ToPoint(at);
+    text.text = label.text;
+    markers->markers.push_back(text);
+    leaders.points.push_back(ToPoint(label.anchor));
+    leaders.points.push_back(ToPoint(at));
+  }
+  if (!leaders.points.empty()) markers->markers.push_back(std::move(leaders));
+}
+
+/// Centre lines of a tree, and from every branch's base to its parent's axis.
+visualization_msgs::Marker Skeleton(const dendro::TreeModel& model,
+                                    int tree_id,
+                                    const MapMarkerStyle& style,
+                                    const std::string& frame_id) {
+  constexpr double kSkeletonWidthM = 0.02;
+  visualization_msgs::Marker skeleton = MakeMarker(
+      model.stamp_ns, frame_id, "skeleton", tree_id + 1, visualization_msgs::Marker::LINE_LIST);
+  skeleton.scale.x = kSkeletonWidthM;
+  const auto add = [&](const Eigen::Vector3d& a,
+                       const Eigen::Vector3d& b,
+                       const std_msgs::ColorRGBA& color) {
+    skeleton.points.push_back(ToPoint(a));
+    skeleton.points.push_back(ToPoint(b));
+    skeleton.colors.push_back(color);
+    skeleton.colors.push_back(color);
+  };
+  for (const dendro::MapCylinder& cylinder : model.cylinders) {
+    if (cylinder.tree_id != tree_id) continue;
+    const auto color = ToColor(dendro::CylinderColor(cylinder, style.color), 1.0F);
+    add(cylinder.start, cylinder.end, color);
+    if (cylinder.position_in_branch > 0 || cylinder.parent_id < 0) continue;
+    const auto parent = std::lower_bound(
+        model.cylinders.begin(),
+        model.cylinders.end(),
+        cylinder.parent_id,
+        [](const dendro::MapCylinder& c, int id) { return c.id < id; });
+    if (parent == model.cylinders.end() || parent->id != cylinder.parent_id) continue;
+    const double along =
+        std::clamp((cylinder.start - parent->start).dot(parent->Axis()), 0.0, parent->Length());
+    add(parent->start + along * parent->Axis(), cylinder.start, color);
+  }
+  return skeleton;
+}
+
+/// 64-bit FNV-1a (Fowler, Noll, Vo), word by word.
+class Fingerprint {
+ public:
+  template <class T>
+  void Add(const T* data, std::size_t count) {
+    const char* bytes = reinterpret_cast<const char*>(data);
+    std::size_t left = count * sizeof(T);
+    for (; left >= 8; left -= 8, bytes += 8) {
+      std::uint64_t word;
+      std::memcpy(&word, bytes, 8);
+      Mix(word);
+    }
+    for (; left > 0; --left, ++bytes) Mix(static_cast<unsigned char>(*bytes));
+  }
+  std::uint64_t value() const { return hash_; }
+
+ private:
+  void Mix(std::uint64_t word) {
+    hash_ = (hash_ ^ word) * 0x100000001b3ULL;
+    hash_ ^= hash_ >> 29;
+  }
+  std::uint64_t hash_ = 0xcbf29ce484222325ULL;
+};
+
+/// What is seen of a marker, its stamp left out.
+std::uint64_t FingerprintOf(const visualization_msgs::Marker& marker) {
+  Fingerprint fingerprint;
+  const double numbers[] = {static_cast<double>(marker.type),
+                            marker.pose.position.x,
+                            marker.pose.position.y,
+                            marker.pose.position.z,
+                            marker.scale.x,
+                            marker.scale.z,
+                            marker.color.a};
+  fingerprint.Add(numbers, std::size(numbers));
+  fingerprint.Add(marker.text.data(), marker.text.size());
+  for (const geometry_msgs::Point& p : marker.points) {
+    const double xyz[] = {p.x, p.y, p.z};
+    fingerprint.Add(xyz, 3);
+  }
+  for (const std_msgs::ColorRGBA& c : marker.colors) {
+    const float rgba[] = {c.r, c.g, c.b, c.a};
+    fingerprint.Add(rgba, 4);
+  }
+  return fingerprint.value();
+}
+
+}  // namespace
+
 visualization_msgs::MarkerArray MapMarkers(const dendro::TreeModel& model,
                                            const MapMarkerStyle& style,
                                            const std::string& frame_id) {
-  constexpr float kAlpha = 0.9F;
-  constexpr double kSkeletonWidthM = 0.02;
-  constexpr double kLabelHeightM = 0.2;
-  constexpr double kLabelGapM = 0.12;
   visualization_msgs::MarkerArray markers;
   markers.markers.push_back(DeleteAll(model.stamp_ns, frame_id));
   std::set<int> trees;
   for (const dendro::MapCylinder& cylinder : model.cylinders) trees.insert(cylinder.tree_id);
+  const int sides = SidesFor(model.cylinders.size(), style.max_triangles);
   for (const int tree : trees) {
-    const dendro::Mesh mesh = dendro::TreeMesh(model, tree, style.color, kSides);
     // Ids of markers are not negative; -1 stands for what is attached to no tree.
-    markers.markers.push_back(
-        MeshMarker(mesh, kAlpha, model.stamp_ns, frame_id, "trees", tree + 1));
-  }
-  if (style.skeleton && !model.cylinders.empty()) {
-    visualization_msgs::Marker skeleton = MakeMarker(
-        model.stamp_ns, frame_id, "skeleton", 0, visualization_msgs::Marker::LINE_LIST);
-    skeleton.scale.x = kSkeletonWidthM;
-    for (const dendro::MapCylinder& cylinder : model.cylinders) {
-      const auto color = ToColor(dendro::CylinderColor(cylinder, style.color), 1.0F);
-      skeleton.points.push_back(ToPoint(cylinder.start));
-      skeleton.points.push_back(ToPoint(cylinder.end));
-      skeleton.colors.push_back(color);
-      skeleton.colors.push_back(color);
+    if (style.alpha > 0.0) {
+      const dendro::Mesh mesh = dendro::TreeMesh(model, tree, style.color, sides, false);
+      markers.markers.push_back(MeshMarker(mesh,
+                                           static_cast<float>(style.alpha),
+                                           model.stamp_ns,
+                                           frame_id,
+                                           "trees",
+                                           tree + 1));
     }
-    markers.markers.push_back(skeleton);
-  }
-  if (style.labels) {
-    for (const dendro::MapBranch& branch : model.branches) {
-      visualization_msgs::Marker label = MakeMarker(model.stamp_ns,
-                                                    frame_id,
-                                                    "labels",
-                                                    branch.id,
-                                                    visualization_msgs::Marker::TEXT_VIEW_FACING);
-      label.scale.z = kLabelHeightM;
-      const Eigen::Vector3d at =
-          (branch.parent_id < 0 ? 0.5 * (branch.base + branch.tip) : branch.tip) +
-          Eigen::Vector3d::UnitZ() * (branch.middle_radius_m + kLabelGapM);
-      label.pose.position = ToPoint(at);
-      label.text = fmt::format("b{}  {:.1f} \u00b1 {:.1f} cm",
-                               branch.id,
-                               100.0 * branch.base_radius_m,
-                               100.0 * branch.base_radius_sigma_m);
-      markers.markers.push_back(label);
-    }
+    if (style.skeleton) markers.markers.push_back(Skeleton(model, tree, style, frame_id));
+    if (style.labels) AppendLabels(model, tree, style, frame_id, &markers);
   }
   return markers;
+}
+
+visualization_msgs::MarkerArray UpdateMarkers(const dendro::TreeModel& model,
+                                              const std::vector<int>& landmark_ids,
+                                              std::int64_t stamp_ns,
+                                              const std::string& frame_id,
+                                              double lifetime_s) {
+  constexpr double kThickerM = 0.01;
+  constexpr float kAlpha = 0.45F;
+  constexpr dendro::Rgb kFlash = {255, 255, 255};
+  visualization_msgs::MarkerArray markers;
+  const std::set<int> observed(landmark_ids.begin(), landmark_ids.end());
+  dendro::Mesh mesh;
+  for (dendro::MapCylinder cylinder : model.cylinders) {
+    if (cylinder.landmark_id < 0 || observed.count(cylinder.landmark_id) == 0) continue;
+    cylinder.radius_m += kThickerM;
+    dendro::AppendFrustum(cylinder, kFlash, kSides, &mesh, false);
+  }
+  if (mesh.triangles.empty()) return markers;
+  markers.markers.push_back(MeshMarker(mesh, kAlpha, stamp_ns, frame_id, "updates", 0));
+  markers.markers.back().lifetime = ros::Duration(lifetime_s);
+  return markers;
+}
+
+visualization_msgs::MarkerArray MarkerChanges::Next(visualization_msgs::MarkerArray markers) {
+  std::map<std::pair<std::string, int>, std::uint64_t> now;
+  visualization_msgs::MarkerArray changed;
+  for (visualization_msgs::Marker& marker : markers.markers) {
+    if (marker.action != visualization_msgs::Marker::ADD) continue;
+    const std::pair<std::string, int> name(marker.ns, marker.id);
+    const std::uint64_t fingerprint = FingerprintOf(marker);
+    now.emplace(name, fingerprint);
+    if (!shown_) continue;
+    const auto before = shown_->find(name);
+    if (before == shown_->end() || before->second != fingerprint) {
+      changed.markers.push_back(std::move(marker));
+    }
+  }
+  if (!shown_) {
+    shown_ = std::move(now);
+    return markers;
+  }
+  for (const auto& [name, fingerprint] : *shown_) {
+    if (now.count(name) > 0) continue;
+    visualization_msgs::Marker gone;
+    gone.ns = name.first;
+    gone.id = name.second;
+    gone.action = visualization_msgs::Marker::DELETE;
+    if (!markers.markers.empty()) gone.header = markers.markers.front().header;
+    changed.markers.push_back(std::move(gone));
+  }
+  shown_ = std::move(now);
+  return changed;
 }
 
 }  // namespace dendro_ros

@@ -319,5 +319,117 @@ TEST(Markers, OneMeshPerTreeAndALabelPerBranch) {
   EXPECT_EQ(labels, 4);
 }
 
+// A tree whose branches leave at the same height all round: labels at their middles would be on top
+// of each other from every side.
+dendro::TreeModel Whorl(int branches, int cylinders_per_branch) {
+  dendro::TreeModel model;
+  dendro::MapTree tree;
+  tree.dbh_m = 0.3;
+  tree.trunk_branch_id = 0;
+  for (int b = 0; b <= branches; ++b) {
+    dendro::MapBranch branch;
+    branch.id = b;
+    branch.tree_id = 0;
+    branch.order = b == 0 ? 0 : 1;
+    branch.parent_id = b == 0 ? -1 : 0;
+    const double angle = 2.4 * b;
+    const Eigen::Vector3d direction =
+        b == 0 ? Eigen::Vector3d(0, 0, 1) : Eigen::Vector3d(std::cos(angle), std::sin(angle), 0.3);
+    branch.base = b == 0 ? Eigen::Vector3d(0, 0, 0) : Eigen::Vector3d(0, 0, 2);
+    branch.tip = branch.base + 2.0 * direction;
+    branch.base_radius_m = 0.1 - 0.001 * b;
+    for (int i = 0; i < cylinders_per_branch; ++i) {
+      dendro::MapCylinder cylinder;
+      cylinder.id = static_cast<int>(model.cylinders.size());
+      cylinder.tree_id = 0;
+      cylinder.branch_id = b;
+      cylinder.landmark_id = b;
+      cylinder.branch_order = branch.order;
+      cylinder.position_in_branch = i;
+      cylinder.parent_id = i > 0 ? cylinder.id - 1 : (b > 0 ? 0 : -1);
+      cylinder.start = branch.base + (branch.tip - branch.base) * i / cylinders_per_branch;
+      cylinder.end = branch.base + (branch.tip - branch.base) * (i + 1) / cylinders_per_branch;
+      cylinder.radius_m = 0.05;
+      cylinder.radius_sigma_m = 0.001;
+      branch.cylinder_ids.push_back(cylinder.id);
+      model.cylinders.push_back(cylinder);
+    }
+    tree.branch_ids.push_back(b);
+    model.branches.push_back(branch);
+  }
+  model.trees = {tree};
+  return model;
+}
+
+TEST(Markers, LabelsOfATreeStandAtDifferentHeights) {
+  MapMarkerStyle style;
+  const auto markers = MapMarkers(Whorl(30, 2), style, "map");
+  std::vector<double> heights;
+  std::string first;
+  for (const auto& marker : markers.markers) {
+    if (marker.type != visualization_msgs::Marker::TEXT_VIEW_FACING) continue;
+    if (heights.empty()) first = marker.text;
+    heights.push_back(marker.pose.position.z);
+    EXPECT_NE(marker.text.find("\u00b1"), std::string::npos);
+    EXPECT_EQ(marker.text.substr(marker.text.size() - 2), "cm");
+  }
+  EXPECT_EQ(first, "tree 0: DBH 30.0 \u00b1 0.0 cm");
+  // Thirteen find a free height near the whorl, and the trunk's own.
+  EXPECT_GE(heights.size(), 12U);
+  std::sort(heights.begin(), heights.end());
+  for (std::size_t i = 1; i < heights.size(); ++i) {
+    EXPECT_GE(heights[i] - heights[i - 1], 1.2 * style.label_height_m);
+  }
+}
+
+TEST(Markers, BigMapsStayBelowTheirTriangles) {
+  const dendro::TreeModel model = Whorl(199, 100);
+  MapMarkerStyle style;
+  std::size_t triangles = 0;
+  for (const auto& marker : MapMarkers(model, style, "map").markers) {
+    if (marker.ns == "trees") triangles += marker.points.size() / 3;
+  }
+  EXPECT_GT(triangles, 200000U);
+  EXPECT_LE(triangles, 420000U);  // the caps at the branches' ends come on top
+}
+
+TEST(Markers, OnlyWhatChangedIsSentAgain) {
+  MarkerChanges changes;
+  dendro::TreeModel model = Whorl(3, 2);
+  const auto all = MapMarkers(model, {}, "map");
+  EXPECT_EQ(changes.Next(all).markers.size(), all.markers.size());
+  EXPECT_TRUE(changes.Next(all).markers.empty());
+  // A later stamp is no change; another colour is one of the mesh and of the lines.
+  model.stamp_ns = 77;
+  EXPECT_TRUE(changes.Next(MapMarkers(model, {}, "map")).markers.empty());
+  MapMarkerStyle by_order;
+  by_order.color = dendro::MeshColor::kByOrder;
+  const auto recoloured = changes.Next(MapMarkers(model, by_order, "map"));
+  ASSERT_EQ(recoloured.markers.size(), 2U);
+  EXPECT_EQ(recoloured.markers[0].ns, "trees");
+  EXPECT_EQ(recoloured.markers[1].ns, "skeleton");
+  // Without labels these are deleted one by one.
+  by_order.labels = false;
+  const auto without = changes.Next(MapMarkers(model, by_order, "map"));
+  EXPECT_EQ(without.markers.size(), 5U);  // four labels and their lines
+  for (const auto& marker : without.markers) {
+    EXPECT_EQ(marker.action, visualization_msgs::Marker::DELETE);
+    EXPECT_EQ(marker.ns.substr(0, 5), "label");
+    EXPECT_EQ(marker.header.frame_id, "map");
+  }
+  changes.Forget();
+  EXPECT_EQ(changes.Next(all).markers.size(), all.markers.size());
+}
+
+TEST(Markers, ObservedLandmarksFlash) {
+  const dendro::TreeModel model = Whorl(3, 2);
+  const auto flash = UpdateMarkers(model, {1, 3, 99}, 5, "map");
+  ASSERT_EQ(flash.markers.size(), 1U);
+  EXPECT_EQ(flash.markers[0].ns, "updates");
+  EXPECT_EQ(flash.markers[0].points.size(), 4U * 2U * 20U * 3U);  // four cylinders, mantles only
+  EXPECT_GT(flash.markers[0].lifetime.toSec(), 0.1);
+  EXPECT_TRUE(UpdateMarkers(model, {99}, 5, "map").markers.empty());
+}
+
 }  // namespace
 }  // namespace dendro_ros

@@ -130,20 +130,41 @@ struct TreeMappingNodeConfig {
 };
 
 struct MapVisualizationNodeConfig {
+  // All but the last three may be changed while the node runs (rosparam set).
   std::string color = "branch";  ///< Colour of the cylinders: branch, order or sigma.
-  bool labels = true;            ///< Radius and sigma of every branch in cm.
+  bool labels = true;            ///< DBH of every tree, radius of its branches with sigma, in cm.
   bool skeleton = true;          ///< Centre lines.
+  bool updates = true;           ///< Flash the cylinders that the last scan observed.
+  double alpha = 0.9;            ///< Opacity of the cylinders; 0: not drawn. 0 to 1.
+  double label_height_m = 0.15;  ///< Height of the letters [m]. > 0.
+  int max_triangles = 400000;    ///< Big maps get cylinders with fewer sides. >= 1000.
+  std::string tree_frame = "tree";     ///< Frame in the middle of the first tree, for a view's camera.
+  std::string icp_frame = "icp_odom";  ///< Frame of the ICP odometry, shown from where the map begins.
 
   void Validate() const {
     if (color != "branch" && color != "order" && color != "sigma") {
       throw std::invalid_argument("color must be branch, order or sigma, got '" + color + "'");
     }
+    if (!(alpha >= 0.0 && alpha <= 1.0)) throw std::invalid_argument("alpha must be from 0 to 1");
+    if (!(label_height_m > 0.0)) throw std::invalid_argument("label_height_m must be positive");
+    if (max_triangles < 1000) throw std::invalid_argument("max_triangles must be at least 1000");
   }
   template <class Visitor>
   void Visit(Visitor&& v) {
     v("color", color);
     v("labels", labels);
     v("skeleton", skeleton);
+    v("updates", updates);
+    v("alpha", alpha);
+    v("label_height_m", label_height_m);
+    v("max_triangles", max_triangles);
+    v("tree_frame", tree_frame);
+    v("icp_frame", icp_frame);
+  }
+  bool operator==(const MapVisualizationNodeConfig& o) const {
+    return color == o.color && labels == o.labels && skeleton == o.skeleton &&
+           updates == o.updates && alpha == o.alpha && label_height_m == o.label_height_m &&
+           max_triangles == o.max_triangles;
   }
 };
 
