@@ -1,11 +1,13 @@
 #!/usr/bin/python3
 """A report of a map directory: one self-contained HTML file and a PDF.
 
-    scripts/report.py MAP_DIR [--truth TRUTH] [--tape CSV] [-o NAME]
+    scripts/report.py MAP_DIR [--truth TRUTH] [--tape CSV] [--bag BAG [--scan N|--stamp S]] [-o NAME]
 
 Writes MAP_DIR/report.html and MAP_DIR/report.pdf (or NAME.html and NAME.pdf). With --truth (the folder
 that simulate_bag writes) radii and trajectory are drawn against it; with --tape a table of differences
-to tape measurements is added (columns: branch or height, radius_cm or circumference_cm). Maps of the thesis' two plants, simulated, also get its tables
+to tape measurements is added (columns: branch or height, radius_cm or circumference_cm). With --bag one
+scan is followed through the stages, as figure 5.2 of the thesis does; without --scan or --stamp it is the
+one in the middle of the map's trajectory. Maps of the thesis' two plants, simulated, also get its tables
 5.1 and 5.2 with a column of ours.
 """
 
@@ -13,6 +15,7 @@ import argparse
 import base64
 import html
 import io
+import itertools
 import os
 import re
 import sys
@@ -25,6 +28,7 @@ from matplotlib.backends.backend_pdf import PdfPages  # noqa: E402
 from dendro_eval.errors import InputError  # noqa: E402
 from dendro_eval.figures import all_figures  # noqa: E402
 from dendro_eval.files import MapDirectory, Truth  # noqa: E402
+from dendro_eval.scan import describe, scan_figures  # noqa: E402
 from dendro_eval.scores import evaluate  # noqa: E402
 from dendro_eval.tape import compare_tape  # noqa: E402
 from dendro_eval.thesis import mean_errors, outside, thesis_table  # noqa: E402
@@ -192,11 +196,27 @@ def table_pages(title, page, rows_per_page=34):
         yield figure
 
 
+def chosen_scan(arguments, map_dir):
+    """The scan of the bag that the report follows through the stages."""
+    if not os.path.isfile(arguments.bag):
+        raise InputError(f"{arguments.bag}: no such bag")
+    if arguments.scan is not None or arguments.stamp is not None:
+        return describe(arguments.bag, arguments.scan, arguments.stamp)
+    if not map_dir.trajectory:
+        return describe(arguments.bag, 0)
+    stamps = list(map_dir.trajectory)
+    return describe(arguments.bag, stamp=stamps[len(stamps) // 2] * 1e-9)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("map_dir", metavar="MAP_DIR")
     parser.add_argument("--truth", help="truth folder of the simulation")
     parser.add_argument("--tape", metavar="CSV", help="tape measurements")
+    parser.add_argument("--bag", help="bag of the map, to follow one of its scans through the stages")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--scan", type=int, metavar="N", help="number of that scan, from 0")
+    which.add_argument("--stamp", type=float, metavar="S", help="stamp of that scan [s]")
     parser.add_argument("-o", "--output", metavar="NAME", help="path without ending; default MAP_DIR/report")
     arguments = parser.parse_args()
     try:
@@ -205,6 +225,7 @@ def main():
         scores = evaluate(map_dir, truth) if truth else None
         tape = compare_tape(arguments.tape, map_dir) if arguments.tape else None
         thesis = thesis_table(map_dir, truth) if truth else None
+        scan = chosen_scan(arguments, map_dir) if arguments.bag else None
         name = arguments.output or os.path.join(arguments.map_dir, "report")
         title = "Map of " + os.path.basename(os.path.normpath(arguments.map_dir))
         parts = [f"<h1>{html.escape(title)}</h1>"]
@@ -244,7 +265,10 @@ def main():
                         plt.close(figure)
 
             add_tables(tables)
-            for _, caption, figure in all_figures(map_dir, truth, scores):
+            figures = all_figures(map_dir, truth, scores)
+            if scan:
+                figures = itertools.chain(figures, scan_figures(scan, map_dir))
+            for _, caption, figure in figures:
                 picture = io.BytesIO()
                 figure.savefig(picture, format="png", metadata={"Software": None})
                 data = base64.b64encode(picture.getvalue()).decode()

@@ -186,6 +186,7 @@ class SegmentFit {
       : image_(scan.image), segment_(segment), config_(config) {}
 
   FittedCylinder Fit();
+  std::optional<Cylinder> Initial();
 
  private:
   bool Collect();
@@ -196,6 +197,8 @@ class SegmentFit {
                               static_cast<std::int32_t>(pixel));
   }
   Beam BeamAt(std::size_t pixel, double range) const;
+  Eigen::Vector3d RingAxis() const;
+  std::optional<Cone> FromWidth(const Eigen::Vector3d& axis) const;
   Cone StartFrom(const Eigen::Vector3d& axis, double* cost) const;
   std::optional<Cone> Start() const;
   Footprint FootprintOf(const Cone& cone, const Beam& beam) const {
@@ -323,18 +326,41 @@ void SegmentFit::CollectEdges() {
   }
 }
 
-// A cone along an axis: the width across the view gives the radius, Marshall's fit the rest.
-Cone SegmentFit::StartFrom(const Eigen::Vector3d& axis, double* cost) const {
+Eigen::Vector3d PrincipalDirection(const std::vector<Eigen::Vector3d>& points) {
+  Eigen::Vector3d mean = Eigen::Vector3d::Zero();
+  for (const Eigen::Vector3d& p : points) mean += p;
+  mean /= static_cast<double>(points.size());
+  Eigen::Matrix3d scatter = Eigen::Matrix3d::Zero();
+  for (const Eigen::Vector3d& p : points) scatter += (p - mean) * (p - mean).transpose();
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(scatter);
+  return solver.eigenvectors().col(2);
+}
+
+// The direction along which the centres of the rings, the means of their returns, are spread.
+Eigen::Vector3d SegmentFit::RingAxis() const {
+  std::vector<Eigen::Vector3d> centres;
+  int count = 0;
+  for (std::size_t i = 0; i < beams_.size(); ++i) {
+    if (i == 0 || beams_[i].row != beams_[i - 1].row) {
+      if (count > 0) centres.back() /= count;
+      centres.push_back(Eigen::Vector3d::Zero());
+      count = 0;
+    }
+    centres.back() += beams_[i].point;
+    ++count;
+  }
+  centres.back() /= count;
+  return PrincipalDirection(centres);
+}
+
+// A cone along an axis, its radius from the width across the view; nothing when looked at end-on.
+std::optional<Cone> SegmentFit::FromWidth(const Eigen::Vector3d& axis) const {
   Eigen::Vector3d view = centroid_ - origin_;
   view -= view.dot(axis) * axis;
   const double distance = view.norm();
+  if (!(distance > 1e-3)) return std::nullopt;
   Cone cone;
   cone.axis = axis;
-  cone.point = centroid_;
-  if (!(distance > 1e-3)) {
-    *cost = std::numeric_limits<double>::infinity();
-    return cone;
-  }
   view /= distance;
   const Eigen::Vector3d side = axis.cross(view);
   std::vector<double> across;
@@ -348,7 +374,21 @@ Cone SegmentFit::StartFrom(const Eigen::Vector3d& axis, double* cost) const {
   cone.radius = half;
   cone.point = centroid_ + view * (0.785 * half) +
                side * (0.5 * (across[across.size() - 1 - trim] + across[trim]));
+  return cone;
+}
 
+// The same, finished by Marshall's fit.
+Cone SegmentFit::StartFrom(const Eigen::Vector3d& axis, double* cost) const {
+  const std::optional<Cone> from_width = FromWidth(axis);
+  if (!from_width) {
+    *cost = std::numeric_limits<double>::infinity();
+    Cone cone;
+    cone.axis = axis;
+    cone.point = centroid_;
+    return cone;
+  }
+  Cone cone = *from_width;
+  const double half = cone.radius;
   std::vector<Eigen::Vector3d> points;
   points.reserve(beams_.size());
   for (const Beam& b : beams_) points.push_back(b.point);
@@ -385,33 +425,11 @@ Cone SegmentFit::StartFrom(const Eigen::Vector3d& axis, double* cost) const {
 }
 
 std::optional<Cone> SegmentFit::Start() const {
-  // Ring centres: the mean of each ring's returns.
-  std::vector<Eigen::Vector3d> centres;
-  int count = 0;
-  for (std::size_t i = 0; i < beams_.size(); ++i) {
-    if (i == 0 || beams_[i].row != beams_[i - 1].row) {
-      if (count > 0) centres.back() /= count;
-      centres.push_back(Eigen::Vector3d::Zero());
-      count = 0;
-    }
-    centres.back() += beams_[i].point;
-    ++count;
-  }
-  centres.back() /= count;
-  const auto principal = [](const std::vector<Eigen::Vector3d>& points) {
-    Eigen::Vector3d mean = Eigen::Vector3d::Zero();
-    for (const Eigen::Vector3d& p : points) mean += p;
-    mean /= static_cast<double>(points.size());
-    Eigen::Matrix3d scatter = Eigen::Matrix3d::Zero();
-    for (const Eigen::Vector3d& p : points) scatter += (p - mean) * (p - mean).transpose();
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(scatter);
-    return Eigen::Vector3d(solver.eigenvectors().col(2));
-  };
   std::vector<Eigen::Vector3d> all;
   for (const Beam& b : beams_) all.push_back(b.point);
   double cost_rings = 0.0, cost_all = 0.0;
-  const Cone rings = StartFrom(principal(centres), &cost_rings);
-  const Eigen::Vector3d major = principal(all);
+  const Cone rings = StartFrom(RingAxis(), &cost_rings);
+  const Eigen::Vector3d major = PrincipalDirection(all);
   // Two starts only where they differ: a trunk's rings point along it, a level branch's do not.
   if (std::abs(major.dot(rings.axis)) > 0.9) {
     return std::isfinite(cost_rings) ? std::optional<Cone>(rings) : std::nullopt;
@@ -644,6 +662,14 @@ void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
   out->end_sigma_m = (steep > 0.5 ? ring_step : column_step) / std::sqrt(3.0);
 }
 
+std::optional<Cylinder> SegmentFit::Initial() {
+  Collect();
+  if (static_cast<int>(beams_.size()) < config_.min_points || num_rings_ < 2) return std::nullopt;
+  const std::optional<Cone> cone = FromWidth(RingAxis());
+  if (!cone) return std::nullopt;
+  return Cylinder{cone->axis, cone->point, 1.0 / cone->radius};
+}
+
 FittedCylinder SegmentFit::Fit() {
   FittedCylinder out;
   out.segment_id = segment_.id;
@@ -747,6 +773,14 @@ CylinderFitter::CylinderFitter(const CylinderFitterConfig& config) : config_(con
   config_.Validate();
 }
 
+static void CheckPixels(const LabelledScan& scan, const Segment& segment) {
+  for (const std::int32_t pixel : segment.pixels) {
+    if (pixel < 0 || static_cast<std::size_t>(pixel) >= scan.image.size()) {
+      throw std::invalid_argument("Segment.pixels: index outside the range image");
+    }
+  }
+}
+
 std::vector<FittedCylinder> CylinderFitter::Fit(const LabelledScan& scan,
                                                 const std::vector<Segment>& segments) const {
   std::vector<FittedCylinder> cylinders;
@@ -756,12 +790,14 @@ std::vector<FittedCylinder> CylinderFitter::Fit(const LabelledScan& scan,
 }
 
 FittedCylinder CylinderFitter::FitSegment(const LabelledScan& scan, const Segment& segment) const {
-  for (const std::int32_t pixel : segment.pixels) {
-    if (pixel < 0 || static_cast<std::size_t>(pixel) >= scan.image.size()) {
-      throw std::invalid_argument("Segment.pixels: index outside the range image");
-    }
-  }
+  CheckPixels(scan, segment);
   return SegmentFit(scan, segment, config_).Fit();
+}
+
+std::optional<Cylinder> CylinderFitter::Initial(const LabelledScan& scan,
+                                                const Segment& segment) const {
+  CheckPixels(scan, segment);
+  return SegmentFit(scan, segment, config_).Initial();
 }
 
 }  // namespace dendro

@@ -75,6 +75,44 @@ def test_map_bag_gives_the_same_bytes_twice(bag, tmp_path):
     assert timing
 
 
+def test_points_follow_the_scans(bag, tmp_path):
+    config = tmp_path / "points.yaml"
+    config.write_text("tree_mapping: {map_cloud: {enabled: true}}\n")
+    good("map_bag", bag, "-o", tmp_path / "with", "--config", config)
+    good("map_bag", bag, "-o", tmp_path / "without")
+    for name in ("cylinders.csv", "trajectory.tum"):  # points change nothing else
+        assert filecmp.cmp(tmp_path / "with" / name, tmp_path / "without" / name, shallow=False), name
+    assert not (tmp_path / "without/points.ply").exists()
+    header = (tmp_path / "with/points.ply").read_bytes()[:200].split(b"element vertex ")[1]
+    assert int(header.split()[0]) > 1000
+    # Going on with such a map keeps its points.
+    good("map_bag", bag, "-o", tmp_path / "more", "--load", tmp_path / "with")
+    assert (tmp_path / "more/points.ply").exists()
+
+
+def test_one_scan_is_described_and_drawn(bag, tmp_path):
+    scan = json.loads(good("describe_scan", bag, "--index", 12).stdout)
+    same = json.loads(good("describe_scan", bag, "--stamp", 1.2).stdout)
+    assert scan["index"] == 12 and scan["stamp_ns"] == same["stamp_ns"] and scan["deskewed"]
+    measured = [s for s in scan["segments"] if s["final"]]
+    assert measured
+    for segment in measured:
+        returns = [p for p in scan["points"] if p[4] == segment["id"]]
+        assert len(returns) == segment["num_pixels"]
+        assert 0.03 < segment["final"]["radius_m"] < 0.35
+        assert segment["initial"] is not None
+    drawn = subprocess.run([sys.executable, ROOT / "scripts/draw_scan.py", bag, "--index", "12", "-o",
+                            tmp_path / "pictures"], capture_output=True, text=True,
+                           env={**os.environ, "DENDRO_BUILD_DIR": str(TOOLS.parents[2])})
+    assert drawn.returncode == 0, drawn.stderr
+    names = {p.name for p in (tmp_path / "pictures").iterdir()}
+    assert names == {"scan_a_labels.png", "scan_b_segments.png", "scan_c_fit.png", "scan_d_cylinders.png"}
+    one_line_error(run("describe_scan", bag, "--index", 999), "no scan 999", "0 to")
+    one_line_error(run("describe_scan", bag, "--stamp", 500), "within a second")
+    one_line_error(run("describe_scan", bag), "--stamp or --index")
+    one_line_error(run("describe_scan", SCENE, "--index", 0), "thesis_tree.yaml")
+
+
 def test_map_bag_goes_on_with_a_map(bag, tmp_path):
     good("map_bag", bag, "-o", tmp_path / "a")
     good("map_bag", bag, "-o", tmp_path / "b", "--load", tmp_path / "a")

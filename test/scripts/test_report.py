@@ -16,6 +16,7 @@ from dendro_eval.errors import InputError  # noqa: E402
 from dendro_eval.figures import sides_seen  # noqa: E402
 from dendro_eval.files import MapDirectory, Truth  # noqa: E402
 from dendro_eval.geometry import perpendicular_basis  # noqa: E402
+from dendro_eval.scan import scan_figures  # noqa: E402
 from dendro_eval.tape import compare_tape  # noqa: E402
 from dendro_eval.thesis import mean_errors, thesis_table  # noqa: E402
 from map_maker import write_map, write_truth  # noqa: E402
@@ -130,6 +131,38 @@ def test_the_tables_of_the_thesis(tmp_path):
     # Another scene has no such table.
     scene.write_text(scene.read_text().replace("palo_verde", "oak"))
     assert thesis_table(MapDirectory(str(tmp_path / "map")), Truth(str(tmp_path / "truth"))) is None
+
+
+def make_scan(segments=True):
+    """A scan of one upright cylinder of 10 cm radius, 4 m in front of the sensor."""
+    rng = np.random.default_rng(1)
+    angle = rng.uniform(np.pi / 2, 3 * np.pi / 2, 80)
+    wood = np.stack([4 + 0.1 * np.cos(angle), 0.1 * np.sin(angle), rng.uniform(-0.5, 0.5, 80)], axis=1)
+    ground = np.stack([rng.uniform(1, 5, 50), rng.uniform(-2, 2, 50), np.full(50, -1.5)], axis=1)
+    fit = {"axis": np.array([0, 0, 1.0]), "point": np.array([4.0, 0, 0]), "foot": np.array([4.0, 0, 0]),
+           "radius_m": 0.1}
+    final = {**fit, "radius_sigma_m": 0.001, "taper_m_per_m": 0.0, "start_s_m": -0.5, "end_s_m": 0.5}
+    return {"stamp_ns": 1600000000123456789, "index": 7, "deskewed": True,
+            "points": np.vstack([wood, ground]), "ring": np.arange(130) % 16,
+            "label": np.array([2] * 80 + [1] * 50), "segment": np.array([0 if segments else -1] * 80 + [-1] * 50),
+            "segments": [{"id": 0, "num_pixels": 80, "status": "MEASURED", "reason": "", "initial": fit,
+                          "final": final}] if segments else []}
+
+
+def test_one_scan_through_the_stages(tmp_path):
+    write_map(tmp_path / "map")
+    map_dir = MapDirectory(str(tmp_path / "map"))
+    names = [name for name, _, _ in scan_figures(make_scan(), map_dir)]
+    assert names == ["scan_a_labels", "scan_b_segments", "scan_c_fit", "scan_d_cylinders", "scan_e_map"]
+    unresolved = make_scan()
+    unresolved["segments"][0].update(final=None, status="UNRESOLVED", reason="too few rings")
+    assert len(list(scan_figures(unresolved))) == 4
+    assert [name for name, _, _ in scan_figures(make_scan(segments=False))] == ["scan_a_labels"]
+    with pytest.raises(InputError, match="no segment 9"):
+        list(scan_figures(make_scan(), segment_id=9))
+    for arguments, word in ((["--bag", tmp_path / "no.bag"], "no such bag"),
+                            (["--bag", __file__, "--scan", "3"], "test_report.py")):
+        assert word in run(tmp_path / "map", *arguments, expect=2)
 
 
 @pytest.mark.parametrize("text, words", [

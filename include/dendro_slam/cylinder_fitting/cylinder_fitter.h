@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "dendro_slam/branch_separation/segment.h"
@@ -85,6 +86,12 @@ class CylinderFitter {
 
   /// Fits one segment. Never throws for bad geometry: it reports UNRESOLVED and why.
   FittedCylinder FitSegment(const LabelledScan& scan, const Segment& segment) const;
+
+  /// Where the fit of a segment starts: the axis along the centres of its rings, the radius from its
+  /// width across the view. For pictures and for those who want to know what the fit moved.
+  /// @return Nothing for segments that are too small to be fitted.
+  /// @throws std::invalid_argument when the segment names a pixel outside the image.
+  std::optional<Cylinder> Initial(const LabelledScan& scan, const Segment& segment) const;
 
   const CylinderFitterConfig& config() const { return config_; }
 
