@@ -93,6 +93,7 @@ class Separation {
   Run Part(const Run& run, int first, int last) const;
   std::vector<Run> CutAtForks(std::vector<Run> runs, int row) const;
   bool BoundedByCloser(const Run& run) const;
+  bool HiddenBetween(const Run& a, const Run& b) const;
   void Assign(std::vector<Run> runs, int row);
   void CutTrack(const std::vector<Run>& runs, std::vector<std::vector<Run>>* pieces) const;
 
@@ -323,6 +324,21 @@ bool Separation::BoundedByCloser(const Run& run) const {
   return false;
 }
 
+// True when nearer surfaces fill most of the gap between two runs of one row: behind them the two
+// may be one. A gap that shows the background is one between two branches.
+bool Separation::HiddenBetween(const Run& a, const Run& b) const {
+  const Run& left = a.first < b.first ? a : b;
+  const Run& right = a.first < b.first ? b : a;
+  const double nearer = std::min(left.range, right.range) - 4.0 * config_.range_sigma_m;
+  int hidden = 0;
+  for (int col = left.last + 1; col < right.first; ++col) {
+    const std::int32_t pixel = Pixel(a.row, col);
+    const auto i = static_cast<std::size_t>(pixel);
+    hidden += image_.HasReturn(i) && image_.point[i].allFinite() && Range(pixel) < nearer;
+  }
+  return hidden > 0 && 2 * hidden >= right.first - left.last - 1;
+}
+
 void Separation::Assign(std::vector<Run> runs, int row) {
   struct Match {
     double cost;
@@ -383,6 +399,7 @@ void Separation::Assign(std::vector<Run> runs, int row) {
       if (std::abs(run.range - e.range) > 4.0 * config_.range_sigma_m + 0.5 * e.width * pixel_m) {
         continue;
       }
+      if (!HiddenBetween(tracks_[t].runs.back(), run)) continue;
       tracks_[t].runs.push_back(run);
       run_used[i] = 1;
       break;

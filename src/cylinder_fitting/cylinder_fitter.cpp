@@ -23,12 +23,15 @@ constexpr int kSettling = 3;
 // Squared length of the last step in standard deviations.
 constexpr double kConverged = 1e-3;
 constexpr double kLargestCycle = 25.0;
+// A footprint of thin rays still leaves the silhouette this uncertain a width [m].
+constexpr double kThinnestBeam = 1e-3;
 
-// The state of the final estimator: the cone's tangent space and the error common to all edges.
+// The state of the final estimator: the cone's tangent space and the error of the share of a beam
+// that makes a return, which shifts all edges by that part of the beam's width.
 constexpr int kStates = 7;
 constexpr int kRadius = 4;
 constexpr int kSlope = 5;
-constexpr int kEdgeBias = 6;
+constexpr int kShare = 6;
 using Vector7d = Eigen::Matrix<double, kStates, 1>;
 using Matrix7d = Eigen::Matrix<double, kStates, kStates>;
 
@@ -51,10 +54,10 @@ struct Edge {
   double competing = 0.0;  // See DetectionOffset.
 };
 
-// A linear observation `low <= g . x <= high` of the state, known to sigma.
+// A linear observation `low <= g . x <= high` of the state, whose ends are known to sigma.
 struct Interval {
   Vector7d g;
-  double low, high;
+  double low, high, sigma;
   // Gaussian message of expectation propagation, in natural parameters of g . x.
   double precision = 0.0, shift = 0.0;
 };
@@ -74,21 +77,19 @@ double NormalCdf(double x) { return 0.5 * std::erfc(-x * 0.7071067811865476); }
 // ways. An interval may be false (a leaf, a knot) with probability `outlier`.
 Posterior Propagate(const Matrix7d& information,
                     const Vector7d& vector,
-                    double sigma,
                     double outlier,
                     std::vector<Interval>* intervals) {
   Posterior out;
   out.covariance = information.ldlt().solve(Matrix7d::Identity());
   out.mean = out.covariance * vector;
   if (intervals->empty()) return out;
-  const double noise = sigma * sigma;
   // Start with every bracket believed, as a uniform error within it; a thin branch's ranges alone
   // may lie so far off that each bracket by itself would look false.
   Matrix7d precision = information;
   Vector7d natural = vector;
   for (Interval& i : *intervals) {
     const double half = 0.5 * (i.high - i.low);
-    i.precision = 1.0 / (half * half / 3.0 + noise);
+    i.precision = 1.0 / (half * half / 3.0 + i.sigma * i.sigma);
     i.shift = i.precision * 0.5 * (i.high + i.low);
     precision += i.precision * i.g * i.g.transpose();
     natural += i.shift * i.g;
@@ -106,7 +107,7 @@ Posterior Propagate(const Matrix7d& information,
       const double vc = 1.0 / cavity_precision;
       const double mc = vc * (m / v - i.shift);
       // Moments of the noisy edge within the bracket, then of the edge itself.
-      const double total = vc + noise;
+      const double total = vc + i.sigma * i.sigma;
       const double s = std::sqrt(total);
       const double a = (i.low - mc) / s;
       const double b = (i.high - mc) / s;
@@ -155,7 +156,7 @@ Posterior Propagate(const Matrix7d& information,
 
 struct Estimate {
   Cone cone;
-  double edge_bias = 0.0;
+  double share_error = 0.0;
   Matrix7d covariance = Matrix7d::Identity();
   std::vector<double> weights;  // Per beam.
   std::vector<double> residuals;
@@ -523,9 +524,10 @@ void SegmentFit::Linearise(Estimate* estimate,
   const double slope_information = 1.0 / (config_.taper_sigma_m_per_m * config_.taper_sigma_m_per_m);
   (*information)(kSlope, kSlope) += slope_information;
   (*vector)[kSlope] -= slope_information * cone.slope;
-  const double bias_information = 1.0 / (config_.edge_bias_sigma_m * config_.edge_bias_sigma_m);
-  (*information)(kEdgeBias, kEdgeBias) += bias_information;
-  (*vector)[kEdgeBias] -= bias_information * estimate->edge_bias;
+  const double share_information =
+      1.0 / (config_.detection_bias_sigma * config_.detection_bias_sigma);
+  (*information)(kShare, kShare) += share_information;
+  (*vector)[kShare] -= share_information * estimate->share_error;
   // A vague prior keeps degenerate geometry solvable; what it alone holds ends as UNRESOLVED.
   const double length = 1.0;
   for (int k = 0; k < 2; ++k) (*information)(k, k) += 1.0;
@@ -543,9 +545,10 @@ void SegmentFit::Linearise(Estimate* estimate,
     const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
     if (width < 0.5 * apart || side * miss.offset < 0.0) continue;
     double hit_Y = 1.0, miss_Y = 1.0;
-    const double hit_edge =
-        DetectionOffset(hit.silhouette, hit.sin_angle, FootprintOf(cone, edge.hit),
-                        config_.detection_fraction, edge.competing, &hit_Y);
+    const Footprint footprint = FootprintOf(cone, edge.hit);
+    const double beam_width = std::max(2.0 * footprint.half_width_m, kThinnestBeam);
+    const double hit_edge = DetectionOffset(hit.silhouette, hit.sin_angle, footprint,
+                                            config_.detection_fraction, edge.competing, &hit_Y);
     const double miss_edge =
         DetectionOffset(miss.silhouette, miss.sin_angle, FootprintOf(cone, edge.miss),
                         config_.detection_fraction, edge.competing, &miss_Y);
@@ -555,14 +558,17 @@ void SegmentFit::Linearise(Estimate* estimate,
     interval.g.head<6>() =
         0.5 * (hit_Y * hit.d_silhouette - side * hit.d_offset + miss_Y * miss.d_silhouette -
                side * miss.d_offset);
-    interval.g[kEdgeBias] = 1.0;
-    const double low = side * hit.offset - hit_edge - estimate->edge_bias;
-    const double high = side * miss.offset - miss_edge - estimate->edge_bias;
+    interval.g[kShare] = beam_width;
+    const double shift = beam_width * estimate->share_error;
+    const double low = side * hit.offset - hit_edge - shift;
+    const double high = side * miss.offset - miss_edge - shift;
     if (!(low < high)) continue;
     interval.low = low;
     interval.high = high;
+    interval.sigma = beam_width * config_.detection_sigma;
     ++estimate->edges;
-    const double slack = 4.0 * std::hypot(config_.edge_sigma_m, config_.edge_bias_sigma_m);
+    const double slack =
+        6.0 * beam_width * std::hypot(config_.detection_sigma, config_.detection_bias_sigma);
     if (low > slack || high < -slack) ++estimate->edges_violated;
     intervals->push_back(interval);
   }
@@ -579,7 +585,7 @@ Estimate SegmentFit::Refine(const Cone& start) const {
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
     Linearise(&estimate, iteration < kSettling, &information, &vector, &intervals);
     const Posterior posterior =
-        Propagate(information, vector, config_.edge_sigma_m, kOutlier, &intervals);
+        Propagate(information, vector, kOutlier, &intervals);
     if (!posterior.mean.allFinite() || !posterior.covariance.allFinite()) return estimate;
     estimate.covariance = posterior.covariance;
     Vector7d step = posterior.mean;
@@ -591,7 +597,7 @@ Estimate SegmentFit::Refine(const Cone& start) const {
     shrink = std::min(shrink, 0.4 * estimate.cone.radius / std::max(1e-12, std::abs(step[kRadius])));
     step *= shrink;
     estimate.cone = estimate.cone.Retract(step.head<6>());
-    estimate.edge_bias += step[kEdgeBias];
+    estimate.share_error += step[kShare];
     if (iteration < kSettling) Recentre(&estimate.cone, estimate.weights);
     if (iteration >= kSettling && statistical < kConverged) {
       estimate.converged = true;
@@ -764,8 +770,8 @@ void CylinderFitterConfig::Validate() const {
   Require(positive(detection_fraction) && detection_fraction < 1.0, "detection_fraction",
           "in (0, 1)");
   Require(not_negative(echo_separation_m), "echo_separation_m", ">= 0");
-  Require(positive(edge_sigma_m), "edge_sigma_m", "> 0");
-  Require(positive(edge_bias_sigma_m), "edge_bias_sigma_m", "> 0");
+  Require(positive(detection_sigma), "detection_sigma", "> 0");
+  Require(positive(detection_bias_sigma), "detection_bias_sigma", "> 0");
   Require(not_negative(ring_bias_sigma_m), "ring_bias_sigma_m", ">= 0");
 }
 

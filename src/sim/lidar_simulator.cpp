@@ -124,6 +124,7 @@ void LidarSimulatorConfig::Validate() const {
   require(return_mode == "strongest" || return_mode == "last" || return_mode == "dual",
           "return_mode: expected strongest, last or dual");
   at_least_zero(range_sigma_m, "range_sigma_m: expected >= 0");
+  at_least_zero(range_uniform_m, "range_uniform_m: expected >= 0");
   at_least_zero(laser_bias_sigma_m, "laser_bias_sigma_m: expected >= 0");
   at_least_zero(aperture_width_m, "aperture_width_m: expected >= 0");
   at_least_zero(aperture_height_m, "aperture_height_m: expected >= 0");
@@ -303,7 +304,9 @@ SimulatedScan LidarSimulator::SimulateScan(int scan_index, const LidarPoseFuncti
         RawReturn r;
         double range = echo.range_m + laser_bias_m_[l];
         if (config_.enable_range_noise) {
-          range += config_.range_sigma_m * CounterRng(seed, key, stream).Gauss();
+          CounterRng noise(seed, key, stream);
+          range += config_.range_sigma_m * noise.Gauss();
+          range += noise.Uniform(-config_.range_uniform_m, config_.range_uniform_m);
         }
         if (config_.enable_quantisation) {
           range = vlp16::kRangeResolutionM * std::round(range / vlp16::kRangeResolutionM);

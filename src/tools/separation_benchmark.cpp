@@ -4,6 +4,7 @@
 #include <iostream>
 #include <map>
 #include <random>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -25,11 +26,16 @@ namespace {
 struct Score {
   long points = 0, pure = 0;
   long branch_points = 0, complete = 0;
+  // Returns in a segment of another branch: of its parent or child, with a shared parent, or neither;
+  // and how many of them lie in rows that also hold returns of the segment's own branch.
+  long of_kin = 0, of_siblings = 0, of_strangers = 0, in_shared_rows = 0;
   int branches = 0, pieces = 0, segments = 0, found = 0;
   double seconds = 0.0;
 
   void Add(const std::vector<dendro::Segment>& separated,
            const std::vector<int>& branch_of_pixel,
+           const std::map<int, int>& parent_of,
+           int cols,
            int min_points) {
     std::map<int, long> returns, own, segments_of;
     for (const int branch : branch_of_pixel) {
@@ -45,6 +51,18 @@ struct Score {
           best = count;
           winner = branch;
         }
+      }
+      std::set<int> own_rows;
+      for (const std::int32_t p : segment.pixels) {
+        if (branch_of_pixel[static_cast<std::size_t>(p)] == winner) own_rows.insert(p / cols);
+      }
+      for (const std::int32_t p : segment.pixels) {
+        const int branch = branch_of_pixel[static_cast<std::size_t>(p)];
+        if (branch == winner) continue;
+        const int parent = parent_of.at(branch), winners_parent = parent_of.at(winner);
+        const bool kin = parent == winner || winners_parent == branch;
+        ++(kin ? of_kin : parent == winners_parent ? of_siblings : of_strangers);
+        in_shared_rows += static_cast<long>(own_rows.count(p / cols));
       }
       points += static_cast<long>(segment.pixels.size());
       pure += best;
@@ -65,6 +83,10 @@ struct Score {
     const auto ratio = [](double a, double b) { return b > 0.0 ? nlohmann::json(a / b) : nlohmann::json(nullptr); };
     return {{"purity", ratio(static_cast<double>(pure), static_cast<double>(points))},
             {"completeness", ratio(static_cast<double>(complete), static_cast<double>(branch_points))},
+            {"impure_parent_or_child", ratio(static_cast<double>(of_kin), static_cast<double>(points))},
+            {"impure_siblings", ratio(static_cast<double>(of_siblings), static_cast<double>(points))},
+            {"impure_strangers", ratio(static_cast<double>(of_strangers), static_cast<double>(points))},
+            {"impure_in_shared_rows", ratio(static_cast<double>(in_shared_rows), static_cast<double>(points))},
             {"branches_found", ratio(found, branches)},
             {"pieces_per_branch", ratio(pieces, branches)},
             {"observable_branches", branches},
@@ -113,6 +135,13 @@ int main(int argc, char** argv) {
       } else {
         scene = dendro::LoadScene(scene_file);
       }
+      std::map<int, int> parent_of;
+      for (std::size_t t = 0; t < scene.trees.size(); ++t) {
+        for (const dendro::SceneBranch& b : scene.trees[t].branches) {
+          const int first = static_cast<int>(t) * 10000;
+          parent_of[first + b.id] = b.parent < 0 ? -1 - static_cast<int>(t) : first + b.parent;
+        }
+      }
       const dendro::Raycaster raycaster(scene);
       const dendro::LidarSimulator simulator(raycaster, dendro::LidarSimulatorConfig());
       std::mt19937 rng(seed + static_cast<unsigned>(s));
@@ -145,12 +174,12 @@ int main(int argc, char** argv) {
         begin = CpuSeconds();
         const std::vector<dendro::Segment> counted = thesis.Separate(scan);
         theirs.seconds += CpuSeconds() - begin;
-        ours.Add(mine, branch, min_points);
-        theirs.Add(counted, branch, min_points);
+        ours.Add(mine, branch, parent_of, scan.image.cols, min_points);
+        theirs.Add(counted, branch, parent_of, scan.image.cols, min_points);
         ++scans;
         if (!json) {
           Score one;
-          one.Add(mine, branch, min_points);
+          one.Add(mine, branch, parent_of, scan.image.cols, min_points);
           fmt::print("scene {} view {}: {} segments, {} branches, purity {:.3f}, completeness {:.3f}\n",
                      seed + static_cast<unsigned>(s), v, mine.size(), one.branches,
                      one.points > 0 ? static_cast<double>(one.pure) / static_cast<double>(one.points) : NAN,

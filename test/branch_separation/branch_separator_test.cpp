@@ -117,6 +117,17 @@ TEST(BranchSeparator, ForkIsTrunkAndBranch) {
   EXPECT_GT(largest[0], trunk_pixels * 9 / 10) << "the trunk goes on past the fork";
 }
 
+TEST(BranchSeparator, ArmsWithTheBackgroundBetweenThemAreNotOneTrunk) {
+  const TestCone trunk = Upright(4, 0.0, 0.17, -1.2, 0.0);
+  const TestCone left = Upright(4, 0.11, 0.08, 0.0, 1.2), right = Upright(4, -0.11, 0.08, 0.0, 1.2);
+  const TestScan test = SimulateCones({trunk, left, right}, TestSensor(), 3);
+  for (const Segment& s : BranchSeparator().Separate(test.scan)) {
+    std::map<int, int> of_cone;
+    for (const std::int32_t p : s.pixels) ++of_cone[test.truth[static_cast<std::size_t>(p)]];
+    EXPECT_LE(std::min(of_cone[1], of_cone[2]), 2) << "segment " << s.id << " holds both arms";
+  }
+}
+
 TEST(BranchSeparator, BranchPassingInFrontIsNotMerged) {
   const TestCone trunk = Upright(5, 0.8, 0.2, -1.3, 1.3);
   const TestCone front{Vector3d(4.2, 0.0, -0.6), Vector3d(4.2, 1.5, 0.6), 0.05, 0.05};

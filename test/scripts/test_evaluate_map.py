@@ -220,6 +220,10 @@ def test_single_scans(tmp_path):
     assert g["radius_bias_rel"] == pytest.approx(0.0181 / 3 / 0.185, abs=1e-3)
     assert g["sigma_coverage_68"] == pytest.approx(2 / 3, rel=1e-5)
     assert g["sigma_coverage_95"] == 1.0
+    assert g["matched_10cm"] == 3
+    assert g["radius_error_rel_median_10cm"] == g["radius_error_rel_median"]
+    assert g["radius_bias_rel_10cm"] == g["radius_bias_rel"]
+    assert g["sigma_coverage_68_10cm"] == g["sigma_coverage_68"]
     assert g["axis_error_deg_median"] == pytest.approx(0.0, abs=1e-6)
     m = s["segmentation"]
     assert m["accuracy"] == 0.8

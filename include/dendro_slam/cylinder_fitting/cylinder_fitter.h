@@ -32,8 +32,8 @@ struct CylinderFitterConfig {
   double beam_divergence_vertical_rad = 1.5e-3;    ///< Full divergence in elevation [rad]. >= 0.
   double detection_fraction = 0.2;  ///< Share of the footprint that makes a return. (0, 1).
   double echo_separation_m = 0.76;  ///< Surfaces nearer to each other give one mixed return [m]. >= 0.
-  double edge_sigma_m = 0.001;      ///< What the silhouette model leaves unknown, per edge [m]. > 0.
-  double edge_bias_sigma_m = 0.0004; ///< The same, common to all edges of a segment [m]. > 0.
+  double detection_sigma = 0.025;       ///< Of detection_fraction from beam to beam: a silhouette is known to this part of the beam's width. > 0.
+  double detection_bias_sigma = 0.010;  ///< Of detection_fraction, common to all edges of a segment. > 0.
   double ring_bias_sigma_m = 0.0;   ///< Offset of a laser's ranges against the others' [m]. >= 0.
 
   template <class Visitor>
@@ -56,8 +56,8 @@ struct CylinderFitterConfig {
     v("beam_divergence_vertical_rad", beam_divergence_vertical_rad);
     v("detection_fraction", detection_fraction);
     v("echo_separation_m", echo_separation_m);
-    v("edge_sigma_m", edge_sigma_m);
-    v("edge_bias_sigma_m", edge_bias_sigma_m);
+    v("detection_sigma", detection_sigma);
+    v("detection_bias_sigma", detection_bias_sigma);
     v("ring_bias_sigma_m", ring_bias_sigma_m);
   }
 

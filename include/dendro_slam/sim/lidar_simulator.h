@@ -25,6 +25,7 @@ struct LidarSimulatorConfig {
 
   bool enable_range_noise = true;
   double range_sigma_m = 0.01;       ///< Gaussian, along the beam [m]: the data sheet's +-3 cm at three sigma.
+  double range_uniform_m = 0.0;      ///< Half-width of an even error along the beam, beside the gaussian one [m]; 0.03 with range_sigma_m 0 is the thesis' noise.
 
   bool enable_laser_bias = false;
   double laser_bias_sigma_m = 0.005; ///< Sigma of the constant offset of each laser [m]; real units differ by millimetres to a centimetre between lasers (Glennie et al. 2016, VLP-16 calibration).
@@ -75,6 +76,7 @@ struct LidarSimulatorConfig {
     v("seed", seed);
     v("enable_range_noise", enable_range_noise);
     v("range_sigma_m", range_sigma_m);
+    v("range_uniform_m", range_uniform_m);
     v("enable_laser_bias", enable_laser_bias);
     v("laser_bias_sigma_m", laser_bias_sigma_m);
     v("enable_quantisation", enable_quantisation);
