@@ -47,6 +47,7 @@ void DataAssociationConfig::Validate() const {
   Require(extent_tolerance_m >= 0.0, "extent_tolerance_m must be >= 0");
   Require(max_radius_ratio > 1.0, "max_radius_ratio must be > 1");
   Require(axis_sigma_floor_deg >= 0.0, "axis_sigma_floor_deg must be >= 0");
+  Require(max_reach_m > 0.0, "max_reach_m must be > 0");
   Require(offset_sigma_floor_m >= 0.0, "offset_sigma_floor_m must be >= 0");
 }
 
@@ -124,6 +125,7 @@ std::vector<Match> Associate(const std::vector<FittedCylinder>& observations,
       if (std::abs(cosine) < std::cos(config.max_axis_angle_deg * kRadPerDeg)) continue;
       const Eigen::Vector3d d = anchor - l.cylinder.point;
       const double s = d.dot(l.cylinder.axis);
+      if (std::abs(s) > config.max_reach_m) continue;
       if ((d - s * l.cylinder.axis).norm() > config.max_offset_m + half) continue;
 
       const LineResidual r = ComputeLineResidual(o, l, T_map_lidar, pose_covariance, config);

@@ -13,6 +13,7 @@
 #include "dendro_slam/factor_graph/cylinder_factor.h"
 #include "dendro_slam/factor_graph/incremental_solver.h"
 #include "dendro_slam/factor_graph/prior_factor.h"
+#include "dendro_slam/mapping/level_factors.h"
 #include "dendro_slam/mapping/relocalizer.h"
 #include "dendro_slam/sensors/lidar_scan.h"
 
@@ -27,6 +28,7 @@ void Require(bool ok, const char* message) {
 }
 
 Key PoseKey(int index) { return MakeKey('x', static_cast<std::uint64_t>(index)); }
+constexpr Key kGroundKey = MakeKey('g', 0);
 Key LandmarkKey(int id) { return MakeKey('l', static_cast<std::uint64_t>(id)); }
 
 bool IsPositiveDefinite(const Eigen::Ref<const Eigen::MatrixXd>& m) {
@@ -98,6 +100,9 @@ void MapperConfig::Validate() const {
   Require(max_acceleration_mps2 > 0.0, "max_acceleration_mps2 must be > 0");
   Require(blind_sigma_m_per_s > 0.0, "blind_sigma_m_per_s must be > 0");
   Require(blind_sigma_rad_per_s > 0.0, "blind_sigma_rad_per_s must be > 0");
+  Require(gravity_sigma_deg >= 0.0, "gravity_sigma_deg must be >= 0");
+  Require(ground_sigma_m >= 0.0, "ground_sigma_m must be >= 0");
+  Require(ground_sigma_deg > 0.0, "ground_sigma_deg must be > 0");
   Require(observation_scale > 0.0, "observation_scale must be > 0");
   Require(observation_axis_floor_deg >= 0.0, "observation_axis_floor_deg must be >= 0");
   Require(observation_offset_floor_m >= 0.0, "observation_offset_floor_m must be >= 0");
@@ -197,6 +202,11 @@ class Mapper::Impl {
                    const Hypothesis& h,
                    bool first,
                    MapperResult* result);
+  void AddLevelFactors(const MapperInput& input,
+                       int key_frame,
+                       const Eigen::Isometry3d& T_map_lidar,
+                       FactorList* factors,
+                       Values* values) const;
   FactorPtr ObservationFactor(int key_frame,
                               int id,
                               const FittedCylinder& fit,
@@ -330,10 +340,52 @@ bool Mapper::Impl::InsideALandmark(const FittedCylinder& fit,
     const LineResidual r =
         ComputeLineResidual(fit, l, T_kf_lidar, Matrix6d::Zero(), config.association);
     if (r.angle_rad > 20.0 * kRadPerDeg) continue;
+    const Eigen::Vector3d apart = T_kf_lidar * fit.cylinder.point - l.cylinder.point;
+    if (std::abs(apart.dot(l.cylinder.axis)) > config.association.max_reach_m) continue;
     if (r.overlap_m < 0.5 * (fit.end_s_m - fit.start_s_m)) continue;
     if (r.offset_m < 0.8 * std::max(r.landmark_radius_m, r.radius_m)) return true;
   }
   return false;
+}
+
+// Gravity as VIO sees it, and the ground.
+void Mapper::Impl::AddLevelFactors(const MapperInput& input,
+                                   int key_frame,
+                                   const Eigen::Isometry3d& T_map_lidar,
+                                   FactorList* factors,
+                                   Values* values) const {
+  if (upright && input.T_odom_lidar && config.gravity_sigma_deg > 0.0) {
+    const Eigen::Vector3d up = input.T_odom_lidar->linear().transpose() * Eigen::Vector3d::UnitZ();
+    factors->push_back(std::make_shared<GravityFactor>(
+        PoseKey(key_frame),
+        up,
+        NoiseModel::Isotropic(2, config.gravity_sigma_deg * kRadPerDeg)
+            .WithKernel(RobustKernel::Huber(3.0))));
+  }
+  if (!input.ground || config.ground_sigma_m == 0.0) return;
+  const Eigen::Vector3d normal = input.ground->normal.cast<double>().normalized();
+  const double height = input.ground->offset;
+  const bool known = solver.Contains(kGroundKey);
+  const Eigen::Vector3d in_map = T_map_lidar.linear() * normal;
+  // The map's plane is z over x and y: that needs a map that is upright, more or less.
+  if (in_map.z() < 0.7) return;
+  if (!known) {
+    const Eigen::Vector3d foot = T_map_lidar.translation() - height * in_map;
+    PointN plane(3);
+    plane[1] = -in_map.x() / in_map.z();
+    plane[2] = -in_map.y() / in_map.z();
+    plane[0] = foot.z() - plane[1] * foot.x() - plane[2] * foot.y();
+    values->Insert(kGroundKey, Value(plane));
+  }
+  Eigen::Vector3d sigmas;
+  sigmas[0] = config.ground_sigma_m;
+  sigmas.tail<2>().setConstant(config.ground_sigma_deg * kRadPerDeg);
+  factors->push_back(std::make_shared<GroundFactor>(
+      PoseKey(key_frame),
+      kGroundKey,
+      normal,
+      height,
+      NoiseModel::Sigmas(sigmas).WithKernel(RobustKernel::Cauchy(2.0))));
 }
 
 FactorPtr Mapper::Impl::ObservationFactor(int key_frame,
@@ -404,6 +456,7 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     }
   }
 
+  AddLevelFactors(input, index, T_map_lidar, &factors, &values);
   std::vector<int> landmark_of(cylinders.size(), -1);
   for (const Match& match : h.matches) {
     landmark_of[static_cast<std::size_t>(match.observation)] =
@@ -870,7 +923,7 @@ std::vector<Landmark> Mapper::Landmarks() const {
   } else {
     map.Restore(impl_->StatesWithMarginals(), impl_->map.next_id());
   }
-  return map.Landmarks(false);
+  return SeparatePieces(map.Landmarks(false));
 }
 
 std::vector<Landmark> Mapper::AllLandmarks() const {

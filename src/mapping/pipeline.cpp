@@ -128,7 +128,9 @@ TreeMappingStage::TreeMappingStage(const TreeMappingConfig& config)
 
 MapperResult TreeMappingStage::Process(const MapperInput& input,
                                        const std::optional<GroundPlane>& ground) {
-  MapperResult result = mapper_.AddScan(input);
+  MapperInput with_ground = input;
+  with_ground.ground = ground;
+  MapperResult result = mapper_.AddScan(with_ground);
   if (ground && !mapper_.relocalizing()) AddGround(*ground, result.T_map_lidar);
   if (result.is_key_frame) {
     model_ = topology_.Build(mapper_.Landmarks(), result.stamp_ns, GroundHeight());
@@ -143,11 +145,13 @@ void TreeMappingStage::AddPoints(const LabelledScan& scan, const Eigen::Isometry
 void TreeMappingStage::AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
   constexpr double kMinUp = 0.9;        // A steeper plane is a bank, or the map is not upright.
   constexpr double kMaxReach_m = 10.0;  // Farther off the slope decides.
+  constexpr double kMaxHeight_m = 5.0;  // From higher up only far ground is seen.
   if (model_.trees.size() != 1) return;
   const Eigen::Vector3d& base = model_.trees.front().base;
   const Eigen::Vector3d normal = T_map_lidar.linear() * ground.normal.cast<double>();
   const Eigen::Vector3d lidar = T_map_lidar.translation();
-  if (normal.z() < kMinUp || (base - lidar).head<2>().norm() > kMaxReach_m) return;
+  if (normal.z() < kMinUp || ground.offset > kMaxHeight_m) return;
+  if ((base - lidar).head<2>().norm() > kMaxReach_m) return;
   // Height(p) = normal . (p - lidar) + offset = 0 below the base.
   const double sideways = normal.head<2>().dot((base - lidar).head<2>());
   ground_z_sum_m_ += lidar.z() - (ground.offset + sideways) / normal.z();

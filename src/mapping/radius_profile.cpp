@@ -4,6 +4,7 @@
 #include <cmath>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 namespace dendro {
 
@@ -31,32 +32,68 @@ struct Estimate {
   double sigma = 0.0;
 };
 
-// Weighted mean of the bins' means; each bin's variance stops at what its scans share.
+// Value below which half of the weight lies.
+double WeightedMedian(std::vector<std::pair<double, double>> value_and_weight) {
+  std::sort(value_and_weight.begin(), value_and_weight.end());
+  double total = 0.0, seen = 0.0;
+  for (const auto& [value, weight] : value_and_weight) total += weight;
+  for (const auto& [value, weight] : value_and_weight) {
+    seen += weight;
+    if (seen >= 0.5 * total) return value;
+  }
+  return value_and_weight.back().first;
+}
+
+// Robust mean of the bins' means (an M-estimate with Cauchy's weights, started at the median); each
+// bin's variance stops at what its scans share.
+//
+// A bend, a neighbour or foliage makes a branch look thicker, and that from some sides only: the
+// median of the sides is far less moved than their mean. Where the sides disagree by more than their
+// sigmas, the excess is taken for an error that most of them share, not one that averages out.
 Estimate Combine(const std::vector<RadiusProfile::Bin>& bins, const RadiusProfileConfig& config) {
-  double total = 0.0, weighted = 0.0;
-  for (const RadiusProfile::Bin& bin : bins) {
-    const double mean = bin.weighted_radius / bin.weight;
-    const double shared = config.bin_sigma_rel * mean;
-    const double variance =
-        1.0 / bin.weight + shared * shared + config.bin_sigma_m * config.bin_sigma_m;
-    total += 1.0 / variance;
-    weighted += mean / variance;
+  constexpr double kCauchyWidth = 2.0;
+  constexpr int kIterations = 5;
+  constexpr double kNormalOverMad = 1.4826;
+  constexpr double kSharedExcess = 0.25;  // Part of the excess variance that more sides do not remove.
+  std::vector<double> mean(bins.size()), variance(bins.size());
+  std::vector<std::pair<double, double>> ranked(bins.size());
+  for (std::size_t i = 0; i < bins.size(); ++i) {
+    mean[i] = bins[i].weighted_radius / bins[i].weight;
+    const double shared = config.bin_sigma_rel * mean[i];
+    variance[i] =
+        1.0 / bins[i].weight + shared * shared + config.bin_sigma_m * config.bin_sigma_m;
+    ranked[i] = {mean[i], 1.0 / variance[i]};
   }
   Estimate out;
-  out.radius = weighted / total;
-  // Bins that disagree by more than their sigmas say that the sigmas are too small.
-  double chi2 = 0.0;
-  for (const RadiusProfile::Bin& bin : bins) {
-    const double mean = bin.weighted_radius / bin.weight;
-    const double shared = config.bin_sigma_rel * mean;
-    const double variance =
-        1.0 / bin.weight + shared * shared + config.bin_sigma_m * config.bin_sigma_m;
-    chi2 += (mean - out.radius) * (mean - out.radius) / variance;
+  out.radius = WeightedMedian(ranked);
+  for (std::size_t i = 0; i < bins.size(); ++i) {
+    const double e = mean[i] - out.radius;
+    ranked[i].first = e * e / variance[i];
   }
-  const double scale =
-      bins.size() > 1 ? std::max(1.0, chi2 / static_cast<double>(bins.size() - 1)) : 1.0;
+  // Spread of the sides in units of their sigmas: 1 if the sigmas are right. With few sides it is
+  // hardly known, and 1 is assumed along with them.
+  const double n = static_cast<double>(bins.size());
+  const double mad = kNormalOverMad * kNormalOverMad * WeightedMedian(ranked);
+  const double excess = std::max(0.0, (mad * n + 2.0) / (n + 2.0) - 1.0);
+  double total = 0.0;
+  for (int iteration = 0; iteration < kIterations; ++iteration) {
+    double weighted = 0.0;
+    total = 0.0;
+    for (std::size_t i = 0; i < bins.size(); ++i) {
+      const double e = mean[i] - out.radius;
+      const double v = variance[i] * (1.0 + excess);
+      const double weight = 1.0 / (v * (1.0 + e * e / (v * kCauchyWidth * kCauchyWidth)));
+      total += weight;
+      weighted += weight * mean[i];
+    }
+    out.radius = weighted / total;
+  }
+  double precision = 0.0;
+  for (std::size_t i = 0; i < bins.size(); ++i) precision += 1.0 / variance[i];
+  const double shared_excess = kSharedExcess * excess * n / precision;
   const double common = config.common_sigma_rel * out.radius;
-  out.sigma = std::sqrt(scale / total + common * common);
+  out.sigma = std::sqrt(1.0 / total + shared_excess + common * common +
+                        config.common_sigma_m * config.common_sigma_m);
   return out;
 }
 
@@ -68,6 +105,7 @@ void RadiusProfileConfig::Validate() const {
   Require(bin_sigma_rel >= 0.0, "bin_sigma_rel must be >= 0");
   Require(bin_sigma_m >= 0.0, "bin_sigma_m must be >= 0");
   Require(common_sigma_rel >= 0.0, "common_sigma_rel must be >= 0");
+  Require(common_sigma_m >= 0.0, "common_sigma_m must be >= 0");
   Require(outlier_sigma > 0.0, "outlier_sigma must be > 0");
 }
 

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 #include <Eigen/Cholesky>
 
@@ -14,6 +15,7 @@ namespace dendro {
 namespace {
 
 constexpr double kTwoPi = 6.283185307179586;
+constexpr double kRadPerDeg = 0.017453292519943295;
 // Taper that an observation too short to show its own may have (a trunk's is about a per cent, a
 // branch's base or a buttress several) [m/m].
 constexpr double kUnknownTaperSigma = 0.02;
@@ -102,7 +104,99 @@ Landmark Summarize(const LandmarkState& state,
   return out;
 }
 
+// The part of a landmark from begin to end along its axis.
+void Clip(double begin, double end, Landmark* landmark) {
+  const double middle = 0.5 * (begin + end);
+  const Matrix5d J = CylinderSlideJacobian(landmark->cylinder, middle);
+  landmark->covariance = J * landmark->covariance * J.transpose();
+  landmark->cylinder = landmark->cylinder.Slid(middle);
+  const double radius = landmark->RadiusAt(middle);
+  const double sigma = landmark->RadiusSigmaAt(middle) / (radius * radius);
+  landmark->cylinder.curvature = 1.0 / radius;
+  landmark->covariance.row(4).setZero();
+  landmark->covariance.col(4).setZero();
+  landmark->covariance(4, 4) = sigma * sigma;
+  // The profile keeps its shape up to the new ends.
+  std::vector<RadiusKnot> profile;
+  for (const double s : {begin, end}) {
+    RadiusKnot knot;
+    knot.s_m = s;
+    knot.radius_m = landmark->RadiusAt(s);
+    knot.radius_sigma_m = landmark->RadiusSigmaAt(s);
+    knot.num_scans = landmark->num_scans;
+    profile.push_back(knot);
+  }
+  for (const RadiusKnot& knot : landmark->profile) {
+    if (knot.s_m > begin && knot.s_m < end) profile.insert(profile.end() - 1, knot);
+  }
+  for (RadiusKnot& knot : profile) knot.s_m -= middle;
+  landmark->profile = std::move(profile);
+  landmark->s_min_m = begin - middle;
+  landmark->s_max_m = end - middle;
+}
+
 }  // namespace
+
+std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
+  constexpr double kMaxAngleDeg = 20.0;
+  constexpr double kMaxOffsetRadii = 0.8;
+  constexpr double kMinRest = 0.25;  // A piece of which less is left lies within the other one.
+  constexpr double kMinRestM = 0.1;
+  std::vector<bool> dropped(landmarks.size(), false);
+  const auto length = [](const Landmark& l) { return l.s_max_m - l.s_min_m; };
+  // Extent of b along a's axis.
+  const auto extent_on = [](const Landmark& a, const Landmark& b) {
+    const Eigen::Vector3d d = b.cylinder.point - a.cylinder.point;
+    const double s = d.dot(a.cylinder.axis), cosine = b.cylinder.axis.dot(a.cylinder.axis);
+    return std::minmax({s + cosine * b.s_min_m, s + cosine * b.s_max_m});
+  };
+  for (std::size_t i = 0; i < landmarks.size(); ++i) {
+    for (std::size_t j = i + 1; j < landmarks.size() && !dropped[i]; ++j) {
+      if (dropped[j]) continue;
+      Landmark& a = landmarks[i];
+      Landmark& b = landmarks[j];
+      if (std::abs(a.cylinder.axis.dot(b.cylinder.axis)) < std::cos(kMaxAngleDeg * kRadPerDeg)) {
+        continue;
+      }
+      const std::pair<double, double> on_a = extent_on(a, b), on_b = extent_on(b, a);
+      const double begin = std::max(a.s_min_m, on_a.first), end = std::min(a.s_max_m, on_a.second);
+      if (end <= begin) continue;
+      const double middle = 0.5 * (begin + end);
+      const Eigen::Vector3d p = a.cylinder.point + middle * a.cylinder.axis;
+      const Eigen::Vector3d d = p - b.cylinder.point;
+      const double s_b = d.dot(b.cylinder.axis);
+      const double offset = (d - s_b * b.cylinder.axis).norm();
+      if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
+      // What is left of each when cut in the middle of the common stretch.
+      const bool b_above = on_a.first + on_a.second > a.s_min_m + a.s_max_m;
+      const bool a_above = on_b.first + on_b.second > b.s_min_m + b.s_max_m;
+      const double rest_a = b_above ? begin - a.s_min_m : a.s_max_m - end;
+      const double rest_b = length(b) - (end - begin);
+      const bool a_within = rest_a < std::max(kMinRestM, kMinRest * length(a));
+      const bool b_within = rest_b < std::max(kMinRestM, kMinRest * length(b));
+      if (a_within || b_within) {
+        dropped[length(a) < length(b) ? i : j] = true;
+        continue;
+      }
+      const double cut_b = std::clamp(s_b, b.s_min_m, b.s_max_m);
+      if (b_above) {
+        Clip(a.s_min_m, middle, &a);
+      } else {
+        Clip(middle, a.s_max_m, &a);
+      }
+      if (a_above) {
+        Clip(b.s_min_m, cut_b, &b);
+      } else {
+        Clip(cut_b, b.s_max_m, &b);
+      }
+    }
+  }
+  std::vector<Landmark> out;
+  for (std::size_t i = 0; i < landmarks.size(); ++i) {
+    if (!dropped[i]) out.push_back(std::move(landmarks[i]));
+  }
+  return out;
+}
 
 void TreeMapConfig::Validate() const {
   Require(confirm_scans >= 1, "confirm_scans must be >= 1");
@@ -117,6 +211,11 @@ void TreeMapConfig::Validate() const {
   Require(gap_min_scans >= 1, "gap_min_scans must be >= 1");
   Require(merge_gate_sigma > 0.0, "merge_gate_sigma must be > 0");
   Require(std::isfinite(merge_min_overlap), "merge_min_overlap must be finite");
+  Require(merge_reach_m > 0.0, "merge_reach_m must be > 0");
+  Require(merge_inside_overlap > 0.0, "merge_inside_overlap must be > 0");
+  Require(merge_inside_angle_deg >= 0.0 && merge_inside_angle_deg < 90.0,
+          "merge_inside_angle_deg must be in [0, 90)");
+  Require(merge_inside_radii >= 0.0, "merge_inside_radii must be >= 0");
 }
 
 TreeMap::TreeMap(TreeMapConfig config, RadiusProfileConfig profile_config)
@@ -179,8 +278,10 @@ void TreeMap::Observe(int id,
   const Cylinder in_map = TransformCylinder(T_map_lidar, observation.cylinder);
   const double sign = in_map.axis.dot(state->line.axis) < 0.0 ? -1.0 : 1.0;
   const double s = (in_map.point - state->line.point).dot(state->line.axis);
-  const double a = s + sign * observation.start_s_m;
-  const double b = s + sign * observation.end_s_m;
+  // Only the part of the observation that is this landmark's.
+  const double reach = 0.5 * config_.max_length_m;
+  const double a = std::clamp(s + sign * observation.start_s_m, -reach, reach);
+  const double b = std::clamp(s + sign * observation.end_s_m, -reach, reach);
 
   RadiusProfile::Observation o;
   o.s_start_m = std::min(a, b);
@@ -266,6 +367,10 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
       const Landmark& b = summaries[j];
       if (!a.confirmed && !b.confirmed) continue;
       if (std::abs(a.cylinder.axis.dot(b.cylinder.axis)) < 0.97) continue;
+      if (std::abs((b.cylinder.point - a.cylinder.point).dot(a.cylinder.axis)) >
+          config_.merge_reach_m) {
+        continue;
+      }
       FittedCylinder as_observation;
       as_observation.status = FitStatus::kMeasured;
       as_observation.cylinder = b.cylinder;
@@ -276,7 +381,8 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
           as_observation, a, Eigen::Isometry3d::Identity(), Matrix6d::Zero(), gates);
       const double shorter = std::min(a.s_max_m - a.s_min_m, b.s_max_m - b.s_min_m);
       if (r.overlap_m < std::min(config_.merge_min_overlap, shorter)) continue;
-      if (r.offset_m > 0.5 * std::max(r.landmark_radius_m, r.radius_m) +
+      if (r.offset_m > std::max(0.5, config_.merge_inside_radii) *
+                               std::max(r.landmark_radius_m, r.radius_m) +
                            association.offset_sigma_floor_m) {
         continue;
       }
@@ -288,7 +394,13 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
       if (merged_length > config_.max_length_m) continue;
       const double mahalanobis2 = r.residual.dot(r.covariance.ldlt().solve(r.residual));
       const double gate = config_.merge_gate_sigma * config_.merge_gate_sigma + 4.0;
-      if (!(mahalanobis2 <= gate)) continue;
+      // Lines of a bent branch miss each other by more than their sigmas; but two branches cannot run
+      // inside each other.
+      const bool inside = r.overlap_m >= config_.merge_inside_overlap * shorter &&
+                          r.angle_rad < config_.merge_inside_angle_deg * kRadPerDeg &&
+                          r.offset_m < config_.merge_inside_radii *
+                                           std::max(r.landmark_radius_m, r.radius_m);
+      if (!(mahalanobis2 <= gate) && !inside) continue;
       // A confirmed landmark is kept before a candidate, the older before the younger.
       const bool swap = b.confirmed && !a.confirmed;
       return swap ? LandmarkMerge{b.id, a.id} : LandmarkMerge{a.id, b.id};

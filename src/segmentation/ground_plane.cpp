@@ -186,7 +186,9 @@ std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
   return EstimateWithin(image, config, static_cast<float>(config.far_range_m));
 }
 
-std::optional<GroundPlane> FitGroundPlane(const LabelledScan& scan, double max_range_m) {
+namespace {
+
+std::optional<GroundPlane> FitGroundPlaneWithin(const LabelledScan& scan, double max_range_m) {
   constexpr int kMinReturns = 100;
   constexpr double kMaxScatter = 0.15;   // [m]
   constexpr double kMinExtent = 0.5;     // Across the narrower direction, standard deviation [m].
@@ -215,6 +217,14 @@ std::optional<GroundPlane> FitGroundPlane(const LabelledScan& scan, double max_r
   plane.offset = static_cast<float>(-normal.dot(mean));
   if (!(plane.offset > 0.1F)) return std::nullopt;
   return plane;
+}
+
+}  // namespace
+
+std::optional<GroundPlane> FitGroundPlane(const LabelledScan& scan, double max_range_m) {
+  constexpr double kFarFactor = 4.0;
+  const auto near = FitGroundPlaneWithin(scan, max_range_m);
+  return near ? near : FitGroundPlaneWithin(scan, kFarFactor * max_range_m);
 }
 
 }  // namespace dendro

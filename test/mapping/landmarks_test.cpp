@@ -1,8 +1,11 @@
 #include <cmath>
+#include <random>
 
 #include <gtest/gtest.h>
 
+#include "../factor_graph/graph_test_util.h"
 #include "dendro_slam/mapping/data_association.h"
+#include "dendro_slam/mapping/level_factors.h"
 #include "dendro_slam/mapping/radius_profile.h"
 #include "dendro_slam/mapping/relocalizer.h"
 #include "dendro_slam/mapping/tree_map.h"
@@ -27,6 +30,7 @@ TEST(RadiusProfile, OneObservationByHand) {
   config.bin_sigma_rel = 0.02;
   config.bin_sigma_m = 0.0;
   config.common_sigma_rel = 0.0;
+  config.common_sigma_m = 0.0;
   RadiusProfile profile;
   profile.Add(Seen(-0.05, 0.05, 0.1, 0.003, 0.0), config);
   const auto knots = profile.Knots(config);
@@ -36,7 +40,8 @@ TEST(RadiusProfile, OneObservationByHand) {
 }
 
 TEST(RadiusProfile, AThousandScansFromOneSideAreWorthAFew) {
-  const RadiusProfileConfig config;
+  RadiusProfileConfig config;
+  config.common_sigma_m = 0.0;
   RadiusProfile one_side, all_sides;
   for (int i = 0; i < 1000; ++i) {
     one_side.Add(Seen(-0.05, 0.05, 0.1, 0.003, 0.1), config);
@@ -47,6 +52,20 @@ TEST(RadiusProfile, AThousandScansFromOneSideAreWorthAFew) {
   EXPECT_GE(side, 0.002);           // what that side shares
   EXPECT_LT(around, 0.4 * side);
   EXPECT_GE(around, 0.0003);        // what all share
+  config.common_sigma_m = 0.0008;
+  EXPECT_NEAR(all_sides.Knots(config)[0].radius_sigma_m, std::hypot(around, 0.0008), 1e-12);
+}
+
+TEST(RadiusProfile, SidesThatSeeABendThickerDoNotDragTheRadius) {
+  const RadiusProfileConfig config;
+  RadiusProfile profile;
+  // Twelve sides agree on 3 cm, six see the bend from the side and take it for 5 cm.
+  for (int i = 0; i < 180; ++i) {
+    const bool bend = i % 3 == 0;
+    profile.Add(Seen(-0.05, 0.05, bend ? 0.05 : 0.03, 0.002, (i % 18 + 0.5) * 2.0 * M_PI / 18.0), config);
+  }
+  const RadiusKnot knot = profile.Knots(config)[0];
+  EXPECT_NEAR(knot.radius_m, 0.03, 0.002);  // The mean is 3.67 cm.
 }
 
 TEST(RadiusProfile, AStretchNewlySeenDoesNotDragTheRest) {
@@ -193,6 +212,75 @@ TEST(Relocalizer, FindsAnyPoseAndRefusesASymmetricScene) {
                                         Known(1, {0.8, 0, 2.5}, {0.8, 0, 0.5}, 0.6, 0.08),
                                         Known(2, {-0.8, 0, 2.5}, {-0.8, 0, 0.5}, 0.6, 0.08)};
   EXPECT_FALSE(Relocalize(symmetric, symmetric, RelocalizerConfig{}));
+}
+
+// Two pieces of one trunk that share a stretch, and a third that lies within the first.
+TEST(SeparatePieces, CutsInTheMiddleOfTheCommonStretchAndDropsWhatLiesWithin) {
+  const auto piece = [](int id, double z, double half, double x) {
+    Landmark l;
+    l.id = id;
+    l.cylinder.axis = Eigen::Vector3d::UnitZ();
+    l.cylinder.point = {x, 0.0, z};
+    l.cylinder.curvature = 5.0;
+    l.s_min_m = -half;
+    l.s_max_m = half;
+    l.profile = {{0.0, 0.2, 0.002, 10}};
+    l.covariance = 1e-4 * Matrix5d::Identity();
+    l.confirmed = true;
+    return l;
+  };
+  const std::vector<Landmark> out = SeparatePieces(
+      {piece(0, 1.0, 1.0, 0.0), piece(1, 2.4, 1.0, 0.01), piece(2, 1.0, 0.3, 0.0), piece(3, 2.0, 1.0, 1.0)});
+  ASSERT_EQ(out.size(), 3u);
+  EXPECT_EQ(out[0].id, 0);
+  EXPECT_EQ(out[1].id, 1);
+  EXPECT_EQ(out[2].id, 3);  // A neighbour a metre away stays as it is.
+  // The common stretch is z from 1.4 to 2.0.
+  EXPECT_NEAR(out[0].cylinder.point.z() + out[0].s_min_m, 0.0, 1e-12);
+  EXPECT_NEAR(out[0].cylinder.point.z() + out[0].s_max_m, 1.7, 1e-12);
+  EXPECT_NEAR(out[1].cylinder.point.z() + out[1].s_min_m, 1.7, 1e-12);
+  EXPECT_NEAR(out[1].cylinder.point.z() + out[1].s_max_m, 3.4, 1e-12);
+  EXPECT_NEAR(out[0].RadiusAt(0.0), 0.2, 1e-12);
+  EXPECT_NEAR(out[2].s_max_m, 1.0, 1e-12);
+}
+
+TEST(LevelFactors, JacobiansMatchCentralDifferences) {
+  std::mt19937 rng(5);
+  for (int i = 0; i < 20; ++i) {
+    const Key pose = MakeKey('x', 0), ground = MakeKey('g', 0);
+    PointN plane(3);
+    plane << test::RandomVector<3>(rng, 0.3);
+    Values values;
+    const Eigen::Isometry3d T = test::RandomPose(rng);
+    values.Insert(pose, Value(T));
+    values.Insert(ground, Value(plane));
+    const Eigen::Vector3d up =
+        (T.linear().transpose() * Eigen::Vector3d::UnitZ() + test::RandomVector<3>(rng, 0.05))
+            .normalized();
+    test::ExpectJacobianMatches(GravityFactor(pose, up, NoiseModel::Isotropic(2, 0.01)), values);
+    test::ExpectJacobianMatches(
+        GroundFactor(pose, ground, up, 1.5, NoiseModel::Isotropic(3, 0.02)), values);
+  }
+}
+
+TEST(LevelFactors, VanishAtTheTruthAndLeaveHeadingFree) {
+  Vector6d xi;
+  xi << 0.1, -0.2, 1.0, 2.0, 3.0, 4.0;
+  const Eigen::Isometry3d T = ExpSe3(xi);
+  const Eigen::Vector3d up = T.linear().transpose() * Eigen::Vector3d::UnitZ();
+  Values values;
+  Eigen::Isometry3d turned = T;
+  turned.linear() = Eigen::AngleAxisd(0.7, Eigen::Vector3d::UnitZ()).toRotationMatrix() * T.linear();
+  values.Insert(MakeKey('x', 0), Value(turned));
+  PointN plane = PointN::Zero(3);
+  plane[0] = 1.0;  // The ground at z = 1: the sensor is t_z - 1 above it.
+  values.Insert(MakeKey('g', 0), Value(plane));
+  const GravityFactor gravity(MakeKey('x', 0), up, NoiseModel::Unit(2));
+  const GroundFactor ground(
+      MakeKey('x', 0), MakeKey('g', 0), up, T.translation().z() - 1.0, NoiseModel::Unit(3));
+  EXPECT_NEAR(gravity.Error(values), 0.0, 1e-18);
+  EXPECT_NEAR(ground.Error(values), 0.0, 1e-18);
+  EXPECT_THROW(GravityFactor(MakeKey('x', 0), 2.0 * up, NoiseModel::Unit(2)), std::invalid_argument);
 }
 
 }  // namespace

@@ -20,6 +20,9 @@ struct DataAssociationConfig {
   double max_radius_ratio = 1.6;    ///< Radii farther apart than this factor never match, unless
                                     ///< their sigmas allow it. > 1.
   double axis_sigma_floor_deg = 1.0;  ///< Bent branches: added to the axis' sigma [deg]. >= 0.
+  double max_reach_m = 1.0;           ///< An observation whose middle is farther than this from the middle
+                                      ///< of a landmark, along its axis, belongs to another piece of a
+                                      ///< trunk or branch: those bend [m]. > 0.
   double offset_sigma_floor_m = 0.01; ///< Bent branches: added to the line's sigma [m]. >= 0.
 
   /// @throws std::invalid_argument naming the field.
@@ -34,6 +37,7 @@ struct DataAssociationConfig {
     v("extent_tolerance_m", extent_tolerance_m);
     v("max_radius_ratio", max_radius_ratio);
     v("axis_sigma_floor_deg", axis_sigma_floor_deg);
+    v("max_reach_m", max_reach_m);
     v("offset_sigma_floor_m", offset_sigma_floor_m);
   }
 };

@@ -20,7 +20,8 @@ struct MapperConfig {
   double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
 
   // Odometry. The messages' own covariances do not tell the drift.
-  double vio_walk_m_per_sqrt_m = 0.012;   ///< Random walk per axis per root metre travelled. >= 0.
+  double vio_walk_m_per_sqrt_m = 0.02;    ///< Random walk per axis per root metre travelled, slow drift
+                                          ///< included. >= 0.
   double vio_walk_rad_per_sqrt_m = 0.003; ///< Random walk of the heading per root metre [rad]. >= 0.
   double vio_tilt_walk_rad_per_sqrt_m = 0.001;  ///< Of roll and pitch: gravity is seen [rad]. >= 0.
   double vio_sigma_m_per_m = 0.006;     ///< Scale error: translation drift per metre travelled. >= 0.
@@ -35,6 +36,12 @@ struct MapperConfig {
                                         ///< ICP [m/s^2]. > 0.
   double blind_sigma_m_per_s = 0.5;     ///< Motion with no odometry at all: sigma per second [m/s]. > 0.
   double blind_sigma_rad_per_s = 0.5;   ///< The same for rotation [rad/s]. > 0.
+
+  // What holds the map upright: errors of neighbouring key frames are alike, so these are several times
+  // the error of one.
+  double gravity_sigma_deg = 0.3;       ///< Tilt that VIO reports, at one key frame [deg]; 0: not used. >= 0.
+  double ground_sigma_m = 0.05;         ///< Height above the ground, at one key frame [m]; 0: not used. >= 0.
+  double ground_sigma_deg = 2.0;        ///< Tilt of the ground, at one key frame [deg]. > 0.
 
   // Observations.
   double observation_scale = 1.5;       ///< The fits' sigmas are multiplied by this. > 0.
@@ -82,6 +89,9 @@ struct MapperConfig {
     v("max_acceleration_mps2", max_acceleration_mps2);
     v("blind_sigma_m_per_s", blind_sigma_m_per_s);
     v("blind_sigma_rad_per_s", blind_sigma_rad_per_s);
+    v("gravity_sigma_deg", gravity_sigma_deg);
+    v("ground_sigma_m", ground_sigma_m);
+    v("ground_sigma_deg", ground_sigma_deg);
     v("observation_scale", observation_scale);
     v("observation_axis_floor_deg", observation_axis_floor_deg);
     v("observation_offset_floor_m", observation_offset_floor_m);
@@ -132,7 +142,8 @@ class Mapper {
   /// (MapperResult::warning says so) and changes nothing. Call Reset() when the data starts anew.
   MapperResult AddScan(const MapperInput& input);
 
-  /// The confirmed landmarks, ascending in id, in the map frame.
+  /// The confirmed landmarks, ascending in id, in the map frame. Pieces of one trunk or branch end
+  /// where the next one begins.
   std::vector<Landmark> Landmarks() const;
   /// The same with the candidates.
   std::vector<Landmark> AllLandmarks() const;

@@ -7,6 +7,7 @@
 
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/odometry/relative_motion.h"
+#include "dendro_slam/segmentation/ground_plane.h"
 
 namespace dendro {
 
@@ -16,6 +17,7 @@ struct MapperInput {
   std::vector<FittedCylinder> cylinders;             ///< Stage 3, lidar frame at the stamp.
   std::optional<Eigen::Isometry3d> T_odom_lidar;     ///< VIO (or MAVROS) pose at the stamp.
   std::optional<RelativeMotion> icp;                 ///< ICP motion from the previous scan to this.
+  std::optional<GroundPlane> ground;                 ///< The ground in the lidar frame, if in sight.
 };
 
 /// What became of one fitted cylinder.

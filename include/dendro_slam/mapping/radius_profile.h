@@ -14,6 +14,7 @@ struct RadiusProfileConfig {
                                     ///< part of the radius. >= 0.
   double bin_sigma_m = 0.0007;      ///< The same, absolute [m]. >= 0.
   double common_sigma_rel = 0.003;  ///< Error that all scans share, as a part of the radius. >= 0.
+  double common_sigma_m = 0.0008;      ///< The same, absolute [m]. >= 0.
   double outlier_sigma = 3.0;       ///< Observations farther from the profile lose weight. > 0.
 
   /// @throws std::invalid_argument naming the field.
@@ -26,13 +27,14 @@ struct RadiusProfileConfig {
     v("bin_sigma_rel", bin_sigma_rel);
     v("bin_sigma_m", bin_sigma_m);
     v("common_sigma_rel", common_sigma_rel);
+    v("common_sigma_m", common_sigma_m);
     v("outlier_sigma", outlier_sigma);
   }
 };
 
 /// Radius of a landmark as a function along its axis.
 ///
-/// A knot per `knot_spacing_m`, each the weighted mean of the observations that cover it. Scans from
+/// A knot per `knot_spacing_m`, each a robust mean of the observations that cover it. Scans from
 /// one side share their errors (the beam's footprint, the same occlusion), so the knot keeps a sum
 /// per viewing direction and distance, and the variance of such a sum stops at `bin_sigma`: a
 /// thousand scans from one side are worth a few, scans from all around keep improving. What every

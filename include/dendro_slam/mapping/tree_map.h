@@ -16,7 +16,8 @@ struct TreeMapConfig {
   double confirm_ratio = 0.3;        ///< And this share of the scans from its first to its last. In [0, 1].
   double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known this well. > 0.
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
-  double max_length_m = 12.0;        ///< A landmark is not extended beyond this [m]. > 0.
+  double max_length_m = 2.0;         ///< A landmark is not extended beyond this: trunks and branches bend,
+                                     ///< and are mapped as a chain of straight pieces [m]. > 0.
   double coverage_cell_m = 0.05;     ///< Resolution of the extents [m]. > 0.
   double end_support = 0.15;         ///< An end lies where the coverage falls below this share of
                                      ///< the scans that cover the densest part. In (0, 1].
@@ -26,6 +27,12 @@ struct TreeMapConfig {
   int gap_min_scans = 20;            ///< And both sides were covered by this many scans. >= 1.
   double merge_gate_sigma = 3.0;     ///< Duplicates: gate on the lines' difference. > 0.
   double merge_min_overlap = -0.1;   ///< Duplicates overlap by at least this [m]; below 0 a gap.
+  double merge_reach_m = 1.0;        ///< Middles farther apart along the axis are two pieces of one bent
+                                     ///< branch, not duplicates [m]. > 0.
+  double merge_inside_overlap = 0.4; ///< Branches that run inside each other over this share of the
+                                     ///< shorter one are one, whatever their sigmas say. > 0.
+  double merge_inside_angle_deg = 12.0;  ///< With axes at most this far apart [deg]. In [0, 90).
+  double merge_inside_radii = 0.8;   ///< And lines at most this many radii of the thicker one. >= 0.
 
   /// @throws std::invalid_argument naming the field.
   void Validate() const;
@@ -44,6 +51,10 @@ struct TreeMapConfig {
     v("gap_min_scans", gap_min_scans);
     v("merge_gate_sigma", merge_gate_sigma);
     v("merge_min_overlap", merge_min_overlap);
+    v("merge_reach_m", merge_reach_m);
+    v("merge_inside_overlap", merge_inside_overlap);
+    v("merge_inside_angle_deg", merge_inside_angle_deg);
+    v("merge_inside_radii", merge_inside_radii);
   }
 };
 
@@ -77,6 +88,11 @@ struct LandmarkMerge {
   int keep_id = 0;                   ///< The older one.
   int drop_id = 0;
 };
+
+/// Cuts landmarks that run inside each other (the pieces of one bent trunk or branch) in the middle of
+/// their common stretch, and leaves out those that lie within another one.
+/// @param landmarks  Ascending in id.
+std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks);
 
 /// The landmarks of the map: candidates and confirmed, with extents, radius profiles and counters.
 /// Geometry of the lines is owned by the factor graph and set from outside.

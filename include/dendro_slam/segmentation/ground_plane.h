@@ -51,6 +51,7 @@ std::optional<GroundPlane> EstimateGroundPlane(const RangeImage& image,
 /// Least-squares plane through the returns that stage 1 labelled ground, near the sensor: sharper
 /// than EstimateGroundPlane, and without the trees.
 /// @param max_range_m  Farther returns are left out: the ground there may have another height [m].
+///                     High above the ground, where none is nearer, the reach is four times as far.
 /// @return nothing with fewer than 100 such returns, where they lie on a line, or where they are no
 ///         plane below the sensor (scatter over 15 cm).
 std::optional<GroundPlane> FitGroundPlane(const LabelledScan& scan, double max_range_m = 15.0);
