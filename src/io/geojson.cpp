@@ -15,53 +15,40 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 constexpr double kDegree = M_PI / 180.0;
-constexpr double kEquatorM = 6378137.0;                // WGS 84
-constexpr double kEccentricity2 = 6.69437999014e-3;
 
 double Rounded(double value, double scale) { return std::round(value * scale) / scale; }
 
-Json Position(const MapPlacement& reference, const Eigen::Vector3d& p) {
-  const PlacedPoint g = ToPlacedPoint(reference, p);
+Json Position(const Georeference& georeference, const Eigen::Vector3d& p) {
+  const GeoPosition g = georeference.Locate(p);
   // Nine decimals of a degree are a tenth of a millimetre.
-  return {Rounded(g.longitude_deg, 1e9), Rounded(g.latitude_deg, 1e9), Rounded(g.altitude_m, 1e4)};
+  Json position = {Rounded(g.longitude_deg, 1e9), Rounded(g.latitude_deg, 1e9)};
+  if (g.altitude_m) position.push_back(Rounded(*g.altitude_m, 1e4));
+  return position;
 }
 
 Json Figure(double value) { return Rounded(value, 1e6); }
 
-}  // namespace
-
-void MapPlacement::Validate() const {
+void Validate(const Georeference& g) {
   const auto require = [](bool good, const char* message) {
     if (!good) throw std::invalid_argument(message);
   };
-  require(std::abs(latitude_deg) <= 89.0, "latitude_deg: must be from -89 to 89");
-  require(std::abs(longitude_deg) <= 180.0, "longitude_deg: must be from -180 to 180");
-  require(std::isfinite(altitude_m), "altitude_m: must be finite");
-  require(std::isfinite(heading_deg), "heading_deg: must be finite");
-  require(std::isfinite(position_sigma_m) && position_sigma_m >= 0.0,
-          "position_sigma_m: must be 0 or positive");
-  require(std::isfinite(heading_sigma_deg) && heading_sigma_deg >= 0.0,
+  require(std::abs(g.origin.latitude_deg) <= 89.0, "latitude_deg: must be from -89 to 89");
+  require(std::abs(g.origin.longitude_deg) <= 180.0, "longitude_deg: must be from -180 to 180");
+  require(std::isfinite(g.origin.altitude_m.value_or(0.0)), "altitude_m: must be finite");
+  require(std::isfinite(g.heading_deg.value_or(0.0)), "heading_deg: must be finite");
+  require(std::isfinite(g.horizontal_sigma_m) && g.horizontal_sigma_m >= 0.0,
+          "horizontal_sigma_m: must be 0 or positive");
+  require(std::isfinite(g.heading_sigma_deg) && g.heading_sigma_deg >= 0.0,
           "heading_sigma_deg: must be 0 or positive");
 }
 
-PlacedPoint ToPlacedPoint(const MapPlacement& reference, const Eigen::Vector3d& p_map) {
-  const double latitude = reference.latitude_deg * kDegree;
-  const double w2 = 1.0 - kEccentricity2 * std::pow(std::sin(latitude), 2);
-  const double normal_m = kEquatorM / std::sqrt(w2);
-  const double meridian_m = normal_m * (1.0 - kEccentricity2) / w2;
-  const double bearing = reference.heading_deg * kDegree;
-  const double east = p_map.x() * std::sin(bearing) - p_map.y() * std::cos(bearing);
-  const double north = p_map.x() * std::cos(bearing) + p_map.y() * std::sin(bearing);
-  return {reference.longitude_deg + east / (normal_m * std::cos(latitude)) / kDegree,
-          reference.latitude_deg + north / meridian_m / kDegree,
-          reference.altitude_m + p_map.z()};
-}
+}  // namespace
 
-std::string ModelGeoJson(const TreeModel& model, const MapPlacement& reference) {
-  reference.Validate();
+std::string ModelGeoJson(const TreeModel& model, const Georeference& georeference) {
+  Validate(georeference);
   Json features = Json::array();
   for (const MapTree& t : model.trees) {
-    const double swing = t.base.head<2>().norm() * reference.heading_sigma_deg * kDegree;
+    const double sigma = georeference.HorizontalSigma(t.base);
     Json p;
     p["kind"] = "tree";
     p["tree_id"] = t.id;
@@ -79,11 +66,10 @@ std::string ModelGeoJson(const TreeModel& model, const MapPlacement& reference) 
     p["status"] = ToString(t.dbh_status);
     p["crown_volume_m3"] = t.crown ? Figure(t.crown->volume_m3) : Json(nullptr);
     p["crown_projected_area_m2"] = t.crown ? Figure(t.crown->projected_area_m2) : Json(nullptr);
-    p["position_sigma_m"] = reference.position_sigma_m > 0.0 || swing > 0.0
-                                ? Figure(std::hypot(reference.position_sigma_m, swing))
-                                : Json(nullptr);
+    p["position_sigma_m"] = sigma > 0.0 ? Figure(sigma) : Json(nullptr);
     features.push_back({{"type", "Feature"},
-                        {"geometry", {{"type", "Point"}, {"coordinates", Position(reference, t.base)}}},
+                        {"geometry",
+                         {{"type", "Point"}, {"coordinates", Position(georeference, t.base)}}},
                         {"properties", std::move(p)}});
   }
   std::map<int, const MapCylinder*> cylinders;
@@ -92,8 +78,8 @@ std::string ModelGeoJson(const TreeModel& model, const MapPlacement& reference) 
     Json line = Json::array();
     for (const int id : b.cylinder_ids) {
       const MapCylinder& c = *cylinders.at(id);
-      if (line.empty()) line.push_back(Position(reference, c.start));
-      line.push_back(Position(reference, c.end));
+      if (line.empty()) line.push_back(Position(georeference, c.start));
+      line.push_back(Position(georeference, c.end));
     }
     if (line.empty()) continue;
     Json p;
@@ -105,9 +91,12 @@ std::string ModelGeoJson(const TreeModel& model, const MapPlacement& reference) 
     p["base_diameter_m"] = Figure(2.0 * b.base_radius_m);
     p["base_diameter_sigma_m"] = Figure(2.0 * b.base_radius_sigma_m);
     p["length_m"] = Figure(b.length_m);
-    features.push_back({{"type", "Feature"},
-                        {"geometry", {{"type", "LineString"}, {"coordinates", std::move(line)}}},
-                        {"properties", std::move(p)}});
+    Json geometry = nullptr;
+    if (georeference.heading_deg) {
+      geometry = {{"type", "LineString"}, {"coordinates", std::move(line)}};
+    }
+    features.push_back(
+        {{"type", "Feature"}, {"geometry", std::move(geometry)}, {"properties", std::move(p)}});
   }
   Json document;
   document["type"] = "FeatureCollection";

@@ -45,7 +45,7 @@ int main(int argc, char** argv) {
          format,
          "treeqsm-mat, treeqsm-txt, simpleforest, raycloudtools, treeloc (a folder), ply-branch, "
          "ply-order, ply-sigma, las or ply-points (wood and leaf points, where the map was made with "
-         "map_cloud/enabled), geojson (needs --georeference), json, csv (a folder with our own tables)")
+         "map_cloud/enabled), geojson (of a map with GNSS fixes, or with --georeference), json, csv (a folder with our own tables)")
       ->required()
       ->check(CLI::IsMember({"treeqsm-mat",
                              "treeqsm-txt",
@@ -69,7 +69,8 @@ int main(int argc, char** argv) {
   app.add_option("--georeference",
                  georeference,
                  "geojson: latitude and longitude of the map's origin [deg], bearing of its x axis "
-                 "clockwise from north [deg], and its altitude [m] (0)")
+                 "clockwise from north [deg], and its altitude [m] (0); without it the map's own, from "
+                 "its fixes")
       ->expected(3, 4)
       ->delimiter(',');
   CLI11_PARSE(app, argc, argv);
@@ -108,7 +109,7 @@ int main(int argc, char** argv) {
     if (format == "csv") {
       into_folder({{"cylinders.csv", CylindersCsv(model)},
                    {"branches.csv", BranchesCsv(model)},
-                   {"trees.csv", TreesCsv(model)}});
+                   {"trees.csv", TreesCsv(model, files.georeference ? &*files.georeference : nullptr)}});
     }
     if (format == "ply-branch")
       outputs.emplace_back(output, MeshToPly(ModelMesh(model, MeshColor::kByBranch)));
@@ -126,17 +127,23 @@ int main(int argc, char** argv) {
       }
     }
     if (format == "geojson") {
-      if (georeference.empty()) {
+      if (georeference.empty() && !files.georeference) {
         throw MapFileError(
             "geojson: the map does not say where it lies; give --georeference "
             "LATITUDE,LONGITUDE,HEADING[,ALTITUDE]");
       }
-      MapPlacement reference;
-      reference.latitude_deg = georeference[0];
-      reference.longitude_deg = georeference[1];
-      reference.heading_deg = georeference[2];
-      if (georeference.size() > 3) reference.altitude_m = georeference[3];
-      outputs.emplace_back(output, ModelGeoJson(model, reference));
+      Georeference place;
+      if (georeference.empty()) {
+        place = *files.georeference;
+      } else {
+        place.origin.latitude_deg = georeference[0];
+        place.origin.longitude_deg = georeference[1];
+        place.heading_deg = georeference[2];
+        place.heading_sigma_deg = 0.0;
+        place.origin.altitude_m = georeference.size() > 3 ? georeference[3] : 0.0;
+      }
+      if (!place.note.empty()) fmt::print(stderr, "export_map: {}\n", place.note);
+      outputs.emplace_back(output, ModelGeoJson(model, place));
     }
     if (format == "json") outputs.emplace_back(output, TreeMapJson(files));
     for (const auto& [path, content] : outputs) WriteFileAtomically(path, content);

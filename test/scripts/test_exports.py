@@ -307,7 +307,9 @@ def test_geojson(maps, tmp_path, kind):
         # x runs 30 degrees east of north, y is to the left of it: 60 degrees west of north.
         assert east == pytest.approx(x * s - y * c, abs=0.01)
         assert north == pytest.approx(x * c + y * s, abs=0.01)
-        assert feature["geometry"]["coordinates"][2] == pytest.approx(350 + z, abs=1e-3)
+        # The map's plane touches the ellipsoid at the origin, so heights above it grow with the distance.
+        height = 350 + z + (east ** 2 + north ** 2) / (2 * 6.37e6)
+        assert feature["geometry"]["coordinates"][2] == pytest.approx(height, abs=1e-3)
         assert str(feature["properties"]["tree_id"]) == row["tree_id"]
         assert feature["properties"]["dbh_m"] == pytest.approx(float(row["dbh_m"] or "nan"), abs=1e-6) \
             or not row["dbh_m"]
@@ -316,6 +318,46 @@ def test_geojson(maps, tmp_path, kind):
         own = [r for r in cylinders if int(r["branch_id"]) == feature["properties"]["branch_id"]]
         assert len(feature["geometry"]["coordinates"]) == len(own) + 1
         assert feature["properties"]["tree_id"] == (int(own[0]["tree_id"]) if own[0]["tree_id"] else None)
+
+
+def test_geojson_of_a_map_with_fixes(maps, tmp_path):
+    with open(maps / "small" / "tree_map.json") as stream:
+        document = json.load(stream)
+    place = {"latitude_deg": 33.4214, "longitude_deg": -111.928, "altitude_m": None, "heading_deg": 30.0,
+             "heading_sigma_deg": 2.0, "horizontal_sigma_m": 0.5, "vertical_sigma_m": 0.0, "pivot": [1.0, -2.0],
+             "num_fixes": 40, "num_outliers": 0, "residual_m": 0.6, "span_m": 12.0, "note": ""}
+
+    def exported(name, **changes):
+        own = tmp_path / name
+        own.mkdir()
+        with open(own / "tree_map.json", "w") as stream:
+            json.dump(dict(document, georeference=dict(place, **changes)), stream)
+        export(own, "geojson", own / "m.json")
+        with open(own / "m.json") as stream:
+            features = json.load(stream)["features"]
+        return ([f for f in features if f["properties"]["kind"] == "tree"],
+                [f for f in features if f["properties"]["kind"] == "branch"])
+
+    trees, branches = exported("known")
+    rows = table(maps / "small", "trees.csv")
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    for feature, row in zip(trees, rows):
+        x, y = float(row["x"]), float(row["y"])
+        at = feature["geometry"]["coordinates"]
+        assert len(at) == 2  # No altitude was known.
+        east, north = metres_between((-111.928, 33.4214), at)
+        assert (east, north) == (pytest.approx(x * s - y * c, abs=0.01), pytest.approx(x * c + y * s, abs=0.01))
+        swing = math.hypot(x - 1, y + 2) * math.radians(2)
+        assert feature["properties"]["position_sigma_m"] == pytest.approx(math.hypot(0.5, swing), abs=1e-4)
+    assert all(f["geometry"]["type"] == "LineString" for f in branches) and branches
+
+    # Without a heading nothing but the pivot's place is known.
+    trees, branches = exported("no_heading", heading_deg=None, note="heading not known")
+    assert all(f["geometry"] is None for f in branches) and branches
+    for feature, row in zip(trees, rows):
+        assert feature["geometry"]["coordinates"] == pytest.approx([-111.928, 33.4214], abs=1e-9)
+        distance = math.hypot(float(row["x"]) - 1, float(row["y"]) + 2)
+        assert feature["properties"]["position_sigma_m"] == pytest.approx(math.hypot(0.5, distance), abs=1e-4)
 
 
 def test_geojson_needs_a_place(maps, tmp_path):
