@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 
@@ -329,7 +330,7 @@ def test_geojson_of_a_map_with_fixes(maps, tmp_path):
 
     def exported(name, **changes):
         own = tmp_path / name
-        own.mkdir()
+        shutil.copytree(maps / "small", own)
         with open(own / "tree_map.json", "w") as stream:
             json.dump(dict(document, georeference=dict(place, **changes)), stream)
         export(own, "geojson", own / "m.json")
