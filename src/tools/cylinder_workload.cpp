@@ -1,11 +1,8 @@
 // Laps around the same trees: how an update's time, the memory and the error of the factor graph behave over a long run.
-#include <sys/resource.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
-#include <ctime>
 #include <fstream>
 #include <iostream>
 #include <map>
@@ -24,6 +21,7 @@
 #include "dendro_slam/factor_graph/junction_point_factor.h"
 #include "dendro_slam/factor_graph/prior_factor.h"
 #include "dendro_slam/geometry/se3.h"
+#include "measure.h"
 
 namespace {
 
@@ -44,27 +42,6 @@ constexpr double kPriorSigma = 1e-4;
 constexpr double kOdometryRotationSigma = 0.001;    // Per scan [rad].
 constexpr double kOdometryTranslationSigma = 0.005; // Per scan [m].
 constexpr double kPointSigmaM = 0.02;
-
-double CpuSeconds() {
-  timespec t{};
-  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
-}
-
-double PeakMemoryMb() {
-  rusage usage{};
-  getrusage(RUSAGE_SELF, &usage);
-  return static_cast<double>(usage.ru_maxrss) / 1024.0;
-}
-
-double Quantile(std::vector<double> values, double q) {
-  if (values.empty()) return 0.0;
-  std::sort(values.begin(), values.end());
-  const double position = q * static_cast<double>(values.size() - 1);
-  const auto low = static_cast<std::size_t>(position);
-  const std::size_t high = std::min(low + 1, values.size() - 1);
-  return values[low] + (position - static_cast<double>(low)) * (values[high] - values[low]);
-}
 
 struct Options {
   double minutes = 10.0;
@@ -268,7 +245,7 @@ int main(int argc, char** argv) {
   try {
     const Run run = Simulate(options);
     if (!options.write.empty()) Write(run, options.write);
-    const double memory_before_mb = PeakMemoryMb();
+    const double memory_before_mb = dendro::measure::PeakMemoryMb();
     dendro::IncrementalSolver solver(config);
     std::vector<double> seconds;
     std::size_t relinearized = 0;
@@ -291,7 +268,7 @@ int main(int argc, char** argv) {
       for (const Scan::Observation& o : scan.observations) {
         AddObservation(options, run, PoseKey(k), T, o, solver, &factors, &values);
       }
-      const double start = CpuSeconds();
+      const double start = dendro::measure::ThreadCpuSeconds();
       const dendro::UpdateResult result = solver.Update(factors, values);
       const auto interval = static_cast<std::size_t>(KeyFrameStride(options));
       if (options.consolidate && interval > 1 && k > 0 && k % interval == 0) {
@@ -299,12 +276,12 @@ int main(int argc, char** argv) {
         for (std::size_t i = k - interval + 1; i < k; ++i) between.push_back(PoseKey(i));
         solver.Marginalize(between);
       }
-      seconds.push_back(CpuSeconds() - start);
+      seconds.push_back(dendro::measure::ThreadCpuSeconds() - start);
       relinearized += result.variables_relinearized;
       reeliminated += result.variables_reeliminated;
       refused += result.steps_refused;
     }
-    const double peak_mb = PeakMemoryMb();
+    const double peak_mb = dendro::measure::PeakMemoryMb();
     const double error = solver.Error();
     nlohmann::ordered_json report;
     report["landmarks"] = options.landmarks;
@@ -316,15 +293,15 @@ int main(int argc, char** argv) {
     double total = 0.0;
     for (const double s : seconds) total += s;
     report["total_cpu_s"] = total;
-    report["p99_ms"] = 1e3 * Quantile(seconds, 0.99);
+    report["p99_ms"] = 1e3 * dendro::measure::Quantile(seconds, 0.99);
     const auto per_minute = static_cast<std::size_t>(
         std::lround(60.0 * static_cast<double>(run.scans.size()) / (options.minutes * 60.0)));
     for (std::size_t begin = 0; begin < seconds.size(); begin += per_minute) {
       const std::vector<double> part(seconds.begin() + static_cast<long>(begin),
                                      seconds.begin() + static_cast<long>(std::min(begin + per_minute, seconds.size())));
-      report["minutes"].push_back({{"median_ms", 1e3 * Quantile(part, 0.5)},
-                                   {"p99_ms", 1e3 * Quantile(part, 0.99)},
-                                   {"max_ms", 1e3 * Quantile(part, 1.0)}});
+      report["minutes"].push_back({{"median_ms", 1e3 * dendro::measure::Quantile(part, 0.5)},
+                                   {"p99_ms", 1e3 * dendro::measure::Quantile(part, 0.99)},
+                                   {"max_ms", 1e3 * dendro::measure::Quantile(part, 1.0)}});
     }
     report["relinearized"] = relinearized;
     report["reeliminated"] = reeliminated;

@@ -1,6 +1,5 @@
 #include <cmath>
 #include <cstdint>
-#include <ctime>
 #include <unistd.h>
 #include <iostream>
 #include <limits>
@@ -24,6 +23,7 @@
 #include "dendro_slam/sim/lidar_simulator.h"
 #include "dendro_slam/sim/raycaster.h"
 #include "dendro_slam/sim/scene.h"
+#include "measure.h"
 
 namespace {
 
@@ -45,13 +45,6 @@ struct Options {
   unsigned seed = 1;
   bool json = false;
 };
-
-/// Seconds of this thread's own work: another program on the machine does not count.
-double CpuSeconds() {
-  timespec t{};
-  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
-}
 
 struct Noise {
   std::string name;
@@ -296,27 +289,27 @@ int main(int argc, char** argv) {
           View view;
           for (std::size_t k = 0; k < noises.size(); ++k) {
             AddNoise(clean, noises[k], &rng, &view);
-            double begin = CpuSeconds();
+            double begin = dendro::measure::ThreadCpuSeconds();
             const FittedCylinder fit = fitter.FitSegment(view.scan, view.segment);
-            ours[k].seconds += CpuSeconds() - begin;
+            ours[k].seconds += dendro::measure::ThreadCpuSeconds() - begin;
             ++ours[k].fits;
             if (fit.status == FitStatus::kMeasured) {
               const double error = fit.cylinder.radius() - radius;
               ours[k].AddRadius(error);
               ours[k].AddCalibration(error, fit, view.truth);
             }
-            begin = CpuSeconds();
+            begin = dendro::measure::ThreadCpuSeconds();
             const FittedCylinder rough = marshall.FitSegment(view.scan, view.segment);
-            simple[k].seconds += CpuSeconds() - begin;
+            simple[k].seconds += dendro::measure::ThreadCpuSeconds() - begin;
             ++simple[k].fits;
             if (rough.reason != dendro::UnresolvedReason::kNotConverged &&
                 rough.reason != dendro::UnresolvedReason::kRadiusOutOfRange &&
                 rough.reason != dendro::UnresolvedReason::kTooFewPoints) {
               simple[k].AddRadius(rough.cylinder.radius() - radius);
             }
-            begin = CpuSeconds();
+            begin = dendro::measure::ThreadCpuSeconds();
             const std::optional<double> pcl = PclRadius(view.scan.image, view.segment);
-            theirs[k].seconds += CpuSeconds() - begin;
+            theirs[k].seconds += dendro::measure::ThreadCpuSeconds() - begin;
             ++theirs[k].fits;
             if (pcl) theirs[k].AddRadius(*pcl - radius);
           }

@@ -17,7 +17,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <ctime>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -31,6 +30,7 @@
 #include "dendro_slam/sensors/vlp16_encoder.h"
 #include "dendro_slam/sim/lidar_simulator.h"
 #include "dendro_slam/sim/scene.h"
+#include "measure.h"
 
 namespace {
 
@@ -45,12 +45,6 @@ struct Options {
   double max_core_percent = 10.0;
   int receive_buffer_bytes = dendro::UdpSourceConfig().receive_buffer_bytes;
 };
-
-double CpuSeconds() {
-  timespec t{};
-  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
-}
 
 /// Endless packets: simulated revolutions over and over, with time and azimuth going on.
 class PacketStream {
@@ -205,14 +199,14 @@ Result Stretch(const Options& options,
   };
   const int sending_ms = static_cast<int>(1e3 * static_cast<double>(count) / rate_hz) + kPatienceMs;
   if (stall && !all_sent.Wait(sending_ms)) throw std::runtime_error("the sending process failed");
-  const double cpu_begin = CpuSeconds();
+  const double cpu_begin = dendro::measure::ProcessCpuSeconds();
   const Clock::time_point begin = Clock::now();
   while (!all_sent.Wait(0)) read_all(0.2);
   read_all(0.0);
   all_read.Give();
   read_all(0.5);
   result.wall_s = std::chrono::duration<double>(Clock::now() - begin).count();
-  result.cpu_s = CpuSeconds() - cpu_begin;
+  result.cpu_s = dendro::measure::ProcessCpuSeconds() - cpu_begin;
   result.received = source.received();
   result.dropped_by_socket = source.dropped();
   result.lost = decoder.counters().lost;

@@ -8,7 +8,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
-#include <ctime>
 #include <exception>
 #include <iostream>
 #include <map>
@@ -23,6 +22,7 @@
 #include "dendro_slam/sensors/deskew.h"
 #include "dendro_slam/sim/flight_path.h"
 #include "dendro_slam/sim/training_scans.h"
+#include "measure.h"
 
 namespace {
 
@@ -49,13 +49,6 @@ std::vector<std::string> Split(const std::string& text) {
   std::istringstream stream(text);
   while (std::getline(stream, word, ',')) words.push_back(word);
   return words;
-}
-
-// CPU time of the process [ms], which with one thread is the time a scan takes on an idle core.
-double CpuMs() {
-  timespec time{};
-  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &time);
-  return 1e3 * static_cast<double>(time.tv_sec) + 1e-6 * static_cast<double>(time.tv_nsec);
 }
 
 struct Counts {
@@ -127,10 +120,10 @@ using Scores = std::map<std::string, std::map<std::string, Score>>;  // By metho
 void ScoreScan(const dendro::TrainingScan& scan, Segmenters* segmenters, Scores* scores) {
   for (auto& [method, segmenter] : *segmenters) {
     dendro::RangeImage image = scan.image;
-    const double start = CpuMs();
+    const double start = 1e3 * dendro::measure::ProcessCpuSeconds();
     const dendro::LabelledScan result = segmenter.Segment(std::move(image));
     Score& score = (*scores)[method][scan.kind];
-    score.milliseconds.push_back(CpuMs() - start);
+    score.milliseconds.push_back(1e3 * dendro::measure::ProcessCpuSeconds() - start);
     for (std::size_t i = 0; i < scan.truth.size(); ++i) {
       if (scan.truth[i] == Label::kNone) continue;
       score.all.Add(result.label[i], scan.truth[i]);

@@ -5,7 +5,6 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdio>
-#include <ctime>
 #include <exception>
 #include <fstream>
 #include <iostream>
@@ -18,6 +17,7 @@
 
 #include "dendro_slam/segmentation/erfnet.h"
 #include "dendro_slam/segmentation/wood_segmenter.h"
+#include "measure.h"
 
 namespace {
 
@@ -30,13 +30,6 @@ struct Options {
   int threads = 1;
   bool layers = false;
 };
-
-// CPU time of the process [ms]: unlike the wall clock it does not count the neighbours' work.
-double CpuMs() {
-  timespec time{};
-  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &time);
-  return 1e3 * static_cast<double>(time.tv_sec) + 1e-6 * static_cast<double>(time.tv_nsec);
-}
 
 void Run(const Options& options) {
   dendro::ErfNet net(dendro::TensorFile::Load(
@@ -61,9 +54,9 @@ void Run(const Options& options) {
                static_cast<std::streamsize>(image * sizeof(float)));
     if (!input) throw std::runtime_error("no image " + line + " in " + options.planes);
     const auto start = std::chrono::steady_clock::now();
-    const double cpu_start = CpuMs();
+    const double cpu_start = 1e3 * dendro::measure::ProcessCpuSeconds();
     const std::vector<float> logits = net.Forward(planes, options.rows, options.cols);
-    const double cpu_ms = CpuMs() - cpu_start;
+    const double cpu_ms = 1e3 * dendro::measure::ProcessCpuSeconds() - cpu_start;
     const std::chrono::duration<double, std::milli> wall =
         std::chrono::steady_clock::now() - start;
     if (output.is_open()) {

@@ -1,6 +1,5 @@
 #include <cmath>
 #include <cstdint>
-#include <ctime>
 #include <iostream>
 #include <map>
 #include <random>
@@ -19,6 +18,7 @@
 #include "dendro_slam/sim/raycaster.h"
 #include "dendro_slam/sim/scene.h"
 #include "dendro_slam/sim/scene_generator.h"
+#include "measure.h"
 
 namespace {
 
@@ -95,12 +95,6 @@ struct Score {
   }
 };
 
-double CpuSeconds() {
-  timespec t{};
-  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
-}
-
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -168,12 +162,12 @@ int main(int argc, char** argv) {
           scan.label[i] = dendro::SurfaceLabel(truth.kind);
           if (scan.IsWood(i)) branch[i] = truth.tree_id * 10000 + truth.branch_id;
         }
-        double begin = CpuSeconds();
+        double begin = dendro::measure::ThreadCpuSeconds();
         const std::vector<dendro::Segment> mine = separator.Separate(scan);
-        ours.seconds += CpuSeconds() - begin;
-        begin = CpuSeconds();
+        ours.seconds += dendro::measure::ThreadCpuSeconds() - begin;
+        begin = dendro::measure::ThreadCpuSeconds();
         const std::vector<dendro::Segment> counted = thesis.Separate(scan);
-        theirs.seconds += CpuSeconds() - begin;
+        theirs.seconds += dendro::measure::ThreadCpuSeconds() - begin;
         ours.Add(mine, branch, parent_of, scan.image.cols, min_points);
         theirs.Add(counted, branch, parent_of, scan.image.cols, min_points);
         ++scans;

@@ -1,10 +1,7 @@
 // Solves an SE(3) pose graph in the g2o format with the incremental factor graph, in one batch or pose by pose.
-#include <sys/resource.h>
-
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
-#include <ctime>
 #include <fstream>
 #include <iostream>
 #include <map>
@@ -21,6 +18,7 @@
 #include "dendro_slam/factor_graph/g2o.h"
 #include "dendro_slam/factor_graph/incremental_solver.h"
 #include "dendro_slam/factor_graph/prior_factor.h"
+#include "measure.h"
 
 namespace {
 
@@ -35,29 +33,6 @@ constexpr double kPriorSigma = 1e-4;
 
 double Seconds(std::chrono::steady_clock::time_point start) {
   return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
-// Processor time of this thread: unlike the clock on the wall it does not depend on what else runs.
-double CpuSeconds() {
-  timespec t{};
-  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
-}
-
-double PeakMemoryMb() {
-  rusage usage{};
-  getrusage(RUSAGE_SELF, &usage);
-  return static_cast<double>(usage.ru_maxrss) / 1024.0;
-}
-
-// The value below which the part q of the sorted values lies.
-double Quantile(const std::vector<double>& sorted, double q) {
-  if (sorted.empty()) return 0.0;
-  const double position = q * static_cast<double>(sorted.size() - 1);
-  const auto low = static_cast<std::size_t>(position);
-  const std::size_t high = std::min(low + 1, sorted.size() - 1);
-  const double part = position - static_cast<double>(low);
-  return sorted[low] * (1.0 - part) + sorted[high] * part;
 }
 
 struct Summary {
@@ -96,9 +71,9 @@ Summary SolveBatch(const PoseGraph& graph, bool chordal, dendro::IncrementalSolv
   FactorList factors = dendro::PoseGraphFactors(graph);
   factors.push_back(FirstPosePrior(graph));
   start = std::chrono::steady_clock::now();
-  const double cpu = CpuSeconds();
+  const double cpu = dendro::measure::ThreadCpuSeconds();
   const UpdateResult result = solver->OptimizeBatch(factors, values);
-  summary.update_s.push_back(CpuSeconds() - cpu);
+  summary.update_s.push_back(dendro::measure::ThreadCpuSeconds() - cpu);
   summary.error_initial = result.error_before;
   Count(result, &summary);
   summary.total_s = Seconds(start);
@@ -132,9 +107,9 @@ Summary SolveIncrementally(const PoseGraph& graph, bool progress, dendro::Increm
     }
     values.Insert(PoseGraphKey(id), pose);
     if (id == graph.poses.begin()->first) factors.push_back(FirstPosePrior(graph));
-    const double cpu = CpuSeconds();
+    const double cpu = dendro::measure::ThreadCpuSeconds();
     const UpdateResult result = solver->Update(factors, values);
-    summary.update_s.push_back(CpuSeconds() - cpu);
+    summary.update_s.push_back(dendro::measure::ThreadCpuSeconds() - cpu);
     Count(result, &summary);
     if (progress && ++done % 50 == 0) {
       fmt::print(stderr, "\r{} of {} poses, 1/2 chi2 {:.3f} ", done, graph.poses.size(), result.error_after);
@@ -212,15 +187,15 @@ int main(int argc, char** argv) {
         report["initialization_s"] = summary.initialization_s;
         report["iteration_s"] = cpu_s / std::max(1, summary.iterations);
       } else {
-        report["update_median_ms"] = 1e3 * Quantile(sorted, 0.5);
-        report["update_p99_ms"] = 1e3 * Quantile(sorted, 0.99);
+        report["update_median_ms"] = 1e3 * dendro::measure::Quantile(sorted, 0.5);
+        report["update_p99_ms"] = 1e3 * dendro::measure::Quantile(sorted, 0.99);
         report["update_max_ms"] = 1e3 * sorted.back();
       }
       report["iterations"] = summary.iterations;
       report["steps_refused"] = summary.steps_refused;
       report["variables_relinearized"] = summary.relinearized;
       report["variables_reeliminated"] = summary.reeliminated;
-      report["peak_memory_mb"] = PeakMemoryMb();
+      report["peak_memory_mb"] = dendro::measure::PeakMemoryMb();
       std::cout << report.dump(2) << '\n';
     } else {
       fmt::print("{} vertices, {} edges, {}\n", graph.poses.size(), graph.edges.size(),
@@ -235,12 +210,12 @@ int main(int argc, char** argv) {
       fmt::print("total           {:.3f} s ({:.3f} s of processor time), {} iterations, {} steps refused\n", summary.total_s, cpu_s, summary.iterations,
                  summary.steps_refused);
       if (incremental) {
-        fmt::print("update          median {:.3f} ms, p99 {:.3f} ms, max {:.3f} ms\n", 1e3 * Quantile(sorted, 0.5),
-                   1e3 * Quantile(sorted, 0.99), 1e3 * sorted.back());
+        fmt::print("update          median {:.3f} ms, p99 {:.3f} ms, max {:.3f} ms\n", 1e3 * dendro::measure::Quantile(sorted, 0.5),
+                   1e3 * dendro::measure::Quantile(sorted, 0.99), 1e3 * sorted.back());
         fmt::print("work            {} variables eliminated again, {} linearised again\n", summary.reeliminated,
                    summary.relinearized);
       }
-      fmt::print("peak memory     {:.1f} MB\n", PeakMemoryMb());
+      fmt::print("peak memory     {:.1f} MB\n", dendro::measure::PeakMemoryMb());
     }
   } catch (const std::exception& error) {
     fmt::print(stderr, "solve_g2o: {}: {}\n", file, error.what());
