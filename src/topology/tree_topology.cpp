@@ -333,6 +333,25 @@ void FinishChain(const std::vector<Piece>& pieces, Chain* chain) {
   }
 }
 
+// Where an arm's axis comes out of a stem near its end: fits of arms often begin inside the fork.
+// @param f  The arm's end that its axis is followed from.
+Vector3d Emergence(const Piece& stem, int end, const Piece& arm, int f) {
+  const Vector3d direction = stem.Outward(end), away = -arm.Outward(f);
+  const Vector3d start = arm.end[f] - stem.end[end];
+  const double height = start.dot(direction), rise = away.dot(direction);
+  const Vector3d lateral = start - height * direction, drift = away - rise * direction;
+  const double radius = stem.radius[end];
+  if (height >= 0.0 || rise <= 0.0 || lateral.squaredNorm() >= radius * radius) return arm.end[f];
+  // Through the end's plane, or through the side: |lateral + t drift| = radius.
+  double t = -height / rise;
+  const double a = drift.squaredNorm(), b = lateral.dot(drift);
+  if (a > 1e-12) {
+    const double c = lateral.squaredNorm() - radius * radius;
+    t = std::min(t, (-b + std::sqrt(b * b - a * c)) / a);
+  }
+  return arm.end[f] + std::min(t, 0.5 * arm.length) * away;
+}
+
 // True when a branch ends here in a fork: two or more arms of similar thickness begin close to this
 // end, lead away from each other, and none of them goes straight on. Then the arms are branches of
 // their own; if one goes on straight, it is the same branch and the others leave it.
@@ -351,7 +370,7 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
       const Vector3d away = -pieces[k].Outward(f);
       const double bend = std::acos(std::clamp(direction.dot(away), -1.0, 1.0));
       if (bend > kMaxForkBendDeg * kDeg) continue;
-      const Vector3d offset = pieces[k].end[f] - stem.end[end];
+      const Vector3d offset = Emergence(stem, end, pieces[k], f) - stem.end[end];
       if (offset.norm() > reach || offset.dot(direction) < -stem.radius[end]) continue;
       // Its axis, run backwards, comes from this end.
       const double miss = (offset - offset.dot(away) * away).norm();

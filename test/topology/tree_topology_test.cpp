@@ -347,6 +347,25 @@ TEST(TreeTopology, ForkContinuesIntoTheThickerArm) {
   EXPECT_EQ(BranchOf(model, 2).parent_id, BranchOf(model, 0).id);
 }
 
+TEST(TreeTopology, ArmsThatWereFittedFromInsideTheForkAreBranchesOfTheirOwn) {
+  // The palo verde's trunk and its two arms as they were mapped: one begins 15 cm and the other 30 cm
+  // below the trunk's end, within it.
+  const auto arm = [](int id, double depth, const Vector3d& direction, double radius) {
+    const Vector3d from = Vector3d(0, 0, 1.0 - depth) - 0.3 * depth * Vector3d(direction.x(), 0, 0);
+    return MakeLandmark(id, from, from + 1.5 * direction.normalized(), radius, 0.95 * radius);
+  };
+  const std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 1}, 0.16, 0.15),
+                                           arm(1, 0.15, {0.45, 0.1, 0.9}, 0.113),
+                                           arm(2, 0.3, {-0.5, -0.1, 0.85}, 0.083)};
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0);
+  ASSERT_EQ(model.branches.size(), 3u);
+  for (const int id : {1, 2}) {
+    EXPECT_EQ(BranchOf(model, id).order, 1);
+    EXPECT_EQ(BranchOf(model, id).parent_id, BranchOf(model, 0).id);
+  }
+}
+
 TEST(TreeTopology, CurvedBranchIsOneBranch) {
   std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 4}, 0.15, 0.12)};
   // A quarter circle of radius 2 m in pieces of 15 degrees, each with its chord.
