@@ -23,10 +23,11 @@ constexpr double kDegree = M_PI / 180.0;
 constexpr double kKnotPeriodS = 0.05;
 constexpr double kLongestS = 86400.0;  ///< Nobody flies for longer than a day.
 
-/// A place at a time.
+/// A place at a time, and how far the rig is leaned back there.
 struct TimedPoint {
   double time_s;
   Eigen::Vector3d position;
+  double tilt_rad = 0.0;
 };
 
 /// The way-points before smoothing, linear in between, at rest outside.
@@ -34,27 +35,31 @@ class RawPath {
  public:
   explicit RawPath(double hover_s) : time_s_(hover_s) {}
 
-  void Add(const Eigen::Vector3d& p, double speed_mps) {
+  void Add(const Eigen::Vector3d& p, double speed_mps, double tilt_rad = 0.0) {
     if (points_.empty()) {
-      points_.push_back({time_s_, p});
+      points_.push_back({time_s_, p, tilt_rad});
       return;
     }
     const double length = (p - points_.back().position).norm();
     if (length < 1e-9) return;
     time_s_ += length / speed_mps;
-    points_.push_back({time_s_, p});
+    points_.push_back({time_s_, p, tilt_rad});
   }
 
   double end_s() const { return time_s_; }
 
-  Eigen::Vector3d At(double t) const {
-    if (t <= points_.front().time_s) return points_.front().position;
-    if (t >= points_.back().time_s) return points_.back().position;
+  /// Position, and the tilt as the fourth number.
+  Eigen::Vector4d At(double t) const {
+    const auto whole = [](const TimedPoint& p) {
+      return Eigen::Vector4d(p.position.x(), p.position.y(), p.position.z(), p.tilt_rad);
+    };
+    if (t <= points_.front().time_s) return whole(points_.front());
+    if (t >= points_.back().time_s) return whole(points_.back());
     const auto after = std::upper_bound(points_.begin(), points_.end(), t,
                                         [](double time, const TimedPoint& p) { return time < p.time_s; });
     const TimedPoint& b = *after;
     const TimedPoint& a = *(after - 1);
-    return a.position + (t - a.time_s) / (b.time_s - a.time_s) * (b.position - a.position);
+    return whole(a) + (t - a.time_s) / (b.time_s - a.time_s) * (whole(b) - whole(a));
   }
 
  private:
@@ -64,7 +69,7 @@ class RawPath {
 
 /// The raw path smoothed by a uniform cubic B-spline whose control points lie on it: twice
 /// continuously differentiable, corners are rounded over about `spacing_s` before and after.
-Eigen::Vector3d Smooth(const RawPath& raw, double spacing_s, double t) {
+Eigen::Vector4d Smooth(const RawPath& raw, double spacing_s, double t) {
   const double x = t / spacing_s;
   const double i = std::floor(x);
   const double u = x - i;
@@ -255,7 +260,7 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
     if (type == "circle") Allow(map, true, {"centre", "radius_m", "altitude_m", "laps", "start_deg"});
     if (type == "helix") Allow(map, true, {"centre", "radius_m", "altitudes_m", "laps", "start_deg"});
     if (type == "conical_helix") Allow(map, true, {"centre", "radii_m", "altitudes_m", "laps", "start_deg"});
-    if (type == "walk") Allow(map, true, {"waypoints", "gait"});
+    if (type == "walk") Allow(map, true, {"waypoints", "gait", "tilt_deg"});
 
     const double speed = PositiveNumber(map, "speed_mps");
     const double hover = map.Number("hover_s", 1.0);
@@ -303,7 +308,13 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
     } else {
       const auto rows = map.Rows("waypoints", 3);
       if (rows.size() < 2) map.Fail("waypoints", "expected at least two way-points [x, y, z]");
-      for (const std::vector<double>& row : rows) raw.Add({row[0], row[1], row[2]}, speed);
+      std::vector<double> tilt_deg(rows.size(), 0.0);
+      if (map.Has("tilt_deg")) tilt_deg = map.Numbers("tilt_deg");
+      if (tilt_deg.size() != rows.size()) map.Fail("tilt_deg", "expected one angle for every way-point [deg]");
+      for (std::size_t i = 0; i < rows.size(); ++i) {
+        if (!(std::abs(tilt_deg[i]) <= 80.0)) map.Fail("tilt_deg", "expected -80 to 80 [deg]");
+        raw.Add({rows[i][0], rows[i][1], rows[i][2]}, speed, tilt_deg[i] * kDegree);
+      }
     }
     path_end_s = raw.end_s() + hover;
     if (path_end_s > kLongestS) {
@@ -351,7 +362,7 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
     if (along) {
       // The first direction in which the path goes anywhere.
       for (int i = 0; i < count; ++i) {
-        const Eigen::Vector3d v = Smooth(raw, corner, (i + 1) * kKnotPeriodS) - Smooth(raw, corner, i * kKnotPeriodS);
+        const Eigen::Vector4d v = Smooth(raw, corner, (i + 1) * kKnotPeriodS) - Smooth(raw, corner, i * kKnotPeriodS);
         if (v.head<2>().norm() > 0.2 * speed * kKnotPeriodS) {
           yaw = std::atan2(v.y(), v.x());
           break;
@@ -360,12 +371,14 @@ FlightPath ParseFlightPath(const std::string& text, const std::string& name) {
     }
     for (int i = 0; i < count; ++i) {
       const double t = i * kKnotPeriodS;
-      Eigen::Vector3d p = Smooth(raw, corner, t);
-      const Eigen::Vector3d v =
+      const Eigen::Vector4d place = Smooth(raw, corner, t);
+      Eigen::Vector3d p = place.head<3>();
+      const Eigen::Vector4d v =
           (Smooth(raw, corner, t + 0.5 * kKnotPeriodS) - Smooth(raw, corner, t - 0.5 * kKnotPeriodS)) /
           kKnotPeriodS;
       const double horizontal = v.head<2>().norm();
-      double roll = wobble.At(t, 0), pitch = wobble.At(t, 1);
+      // Leaning back turns the nose up, against the positive pitch.
+      double roll = wobble.At(t, 0), pitch = wobble.At(t, 1) - place[3];
       if (gait) {
         // The gait fades in and out with the speed.
         const double strength = std::min(1.0, horizontal / speed);

@@ -91,6 +91,31 @@ TEST(FlightPath, HelixEndsWhereItShould) {
   EXPECT_TRUE(path.trajectory.Pose(1e9).translation().isApprox(Eigen::Vector3d(-3, 0, 4), 1e-6));
 }
 
+TEST(FlightPath, AWalkerLeansTheRigBackBetweenWayPoints) {
+  // Level for the first 4 m, then up to 30 degrees over the next 4 m, at 1 m/s without gait.
+  const std::string text =
+      "type: walk\nwaypoints: [[0, 0, 1.5], [4, 0, 1.5], [8, 0, 1.5]]\ntilt_deg: [0, 0, 30]\nspeed_mps: 1\n"
+      "hover_s: 2\nyaw: 90\ngait: {step_hz: 1, bob_m: 0, sway_m: 0, roll_deg: 0, pitch_deg: 0}\n";
+  const FlightPath path = ParseFlightPath(text, "p.yaml");
+  const auto rise_deg = [&](double t) {
+    const Eigen::Vector3d nose = path.trajectory.Pose(t).linear() * Eigen::Vector3d::UnitX();
+    EXPECT_NEAR(nose.x(), 0.0, 1e-9);  // Leaning turns the nose up where it looks, not aside.
+    return std::asin(nose.z()) * 180.0 / M_PI;
+  };
+  EXPECT_NEAR(rise_deg(3.0), 0.0, 1e-6);
+  EXPECT_NEAR(rise_deg(8.0), 15.0, 0.01);
+  EXPECT_NEAR(rise_deg(path.duration_s), 30.0, 0.1);
+  EXPECT_THROW(ParseFlightPath(text + "\n# one too few\n" + "wobble: {seed: 1, tilt: 2}\n", "p.yaml"), SceneFileError);
+  std::string few = text;
+  few.replace(few.find("[0, 0, 30]"), 10, "[0, 30]");
+  try {
+    ParseFlightPath(few, "p.yaml");
+    ADD_FAILURE() << "two angles for three way-points";
+  } catch (const SceneFileError& e) {
+    EXPECT_THAT(e.what(), AllOf(HasSubstr("p.yaml:3"), HasSubstr("tilt_deg"), HasSubstr("every way-point")));
+  }
+}
+
 TEST(FlightPath, PosesArePassedThroughExactly) {
   const auto folder = std::filesystem::temp_directory_path() / ("dendro_path_test_" + std::to_string(::getpid()));
   std::filesystem::create_directories(folder);
