@@ -28,6 +28,10 @@ constexpr double kStraightOnDeg = 14.0;
 constexpr double kMaxForkBendDeg = 60.0;
 constexpr double kForkOpeningDeg = 25.0;
 constexpr double kForkRadiusRatio = 1.6;
+// What leaves a branch within this many of its radii from its beginning, or before it, is its sibling,
+// unless that costs this much more.
+constexpr double kSiblingRadii = 1.5;
+constexpr double kSiblingExtraCost = 1.0;
 // Two pieces that run the same way to within this, their axes closer than this part of their radii's
 // sum, fill the same space.
 constexpr double kSameWayDeg = 15.0;
@@ -577,6 +581,44 @@ std::vector<int> MinimumArborescence(int num_vertices, int root, const std::vect
   return chosen;
 }
 
+// The arms of a fork meet at the end of their stem, of which the last decimetres are often hidden: the
+// nearest wood of one arm is then the other. Whatever leaves a branch where that branch itself begins
+// leaves the branch's parent, if it reaches that.
+// @param ends         Of the chains.
+// @param edges        Ways for a chain (to) to hang on another (from); the attachments are theirs.
+// @param hang         The chosen attachment of each chain; changed.
+void LiftSiblings(const std::vector<std::array<ChainEnd, 2>>& ends,
+                  const std::vector<Edge>& edges,
+                  const std::vector<Attachment>& attachments,
+                  std::vector<Attachment>* hang) {
+  const int n = static_cast<int>(ends.size());
+  bool changed = true;
+  // Every change brings a chain nearer to the root: at most n rounds.
+  for (int round = 0; changed && round < n; ++round) {
+    changed = false;
+    for (int c = 0; c < n; ++c) {
+      const int p = (*hang)[c].parent;
+      if (p < 0 || (*hang)[p].parent < 0) continue;
+      const int grandparent = (*hang)[p].parent;
+      const ChainEnd& base = ends[p][(*hang)[p].child_end];
+      const ChainEnd& own = ends[c][(*hang)[c].child_end];
+      const double from_base = ((*hang)[c].junction - base.point).dot(-base.outward);
+      if (from_base > kSiblingRadii * base.radius) continue;
+      if (own.outward.dot(base.outward) > std::cos(kForkOpeningDeg * kDeg)) continue;
+      for (std::size_t e = 0; e < edges.size(); ++e) {
+        if (edges[e].to != c || edges[e].from != grandparent) continue;
+        if (attachments[e].child_end != (*hang)[c].child_end ||
+            attachments[e].cost > (*hang)[c].cost + kSiblingExtraCost) {
+          continue;
+        }
+        (*hang)[c] = attachments[e];
+        changed = true;
+        break;
+      }
+    }
+  }
+}
+
 // -------------------------------------------------------------------------------------------
 // Cutting into cylinders
 // -------------------------------------------------------------------------------------------
@@ -819,6 +861,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
   if (n > 0) chosen = MinimumArborescence(n + 1, n, edges);
   std::vector<Attachment> hang(n);
   for (int c = 0; c < n; ++c) hang[c] = attachments[chosen[c]];
+  LiftSiblings(ends, edges, attachments, &hang);
 
   // --- Order of the chains: parents before children; roots that are trunks --------------------
   std::vector<std::vector<int>> children(n);

@@ -366,6 +366,22 @@ TEST(TreeTopology, ArmsThatWereFittedFromInsideTheForkAreBranchesOfTheirOwn) {
   }
 }
 
+TEST(TreeTopology, ArmsOfAForkWhoseStemEndIsHiddenAreSiblings) {
+  // 35 cm of the stem below the fork were not seen: each arm is nearer to the other than to the stem.
+  const std::vector<Landmark> landmarks = {
+      MakeLandmark(0, {0, 0, 0}, {0, 0, 2}, 0.14, 0.11),
+      MakeLandmark(1, {0.06, -0.04, 2.35}, {1.2, -0.8, 4.5}, 0.07, 0.05),
+      MakeLandmark(2, {-0.03, 0.02, 2.4}, {-1.2, 0.9, 4.6}, 0.07, 0.05),
+      // A true child, a little farther up one of the arms.
+      MakeLandmark(3, {0.32, -0.1, 2.75}, {1.2, 0.9, 3.4}, 0.02, 0.01)};
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0);
+  ASSERT_EQ(model.branches.size(), 4u);
+  EXPECT_EQ(BranchOf(model, 1).parent_id, BranchOf(model, 0).id);
+  EXPECT_EQ(BranchOf(model, 2).parent_id, BranchOf(model, 0).id);
+  EXPECT_EQ(BranchOf(model, 3).parent_id, BranchOf(model, 1).id);
+}
+
 TEST(TreeTopology, CurvedBranchIsOneBranch) {
   std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 4}, 0.15, 0.12)};
   // A quarter circle of radius 2 m in pieces of 15 degrees, each with its chord.
