@@ -142,6 +142,10 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
   constexpr double kMaxOffsetRadii = 0.8;
   constexpr double kMinRest = 0.25;  // A piece of which less is left lies within the other one.
   constexpr double kMinRestM = 0.1;
+  // The same wood measured twice has one radius: a piece that stays in another's wood with a radius that
+  // differs by more than this, along this share of the shorter one, is no wood.
+  constexpr double kSameWoodRatio = 1.4;
+  constexpr double kSameWoodShare = 0.4;
   std::vector<bool> dropped(landmarks.size(), false);
   const auto length = [](const Landmark& l) { return l.s_max_m - l.s_min_m; };
   // Extent of b along a's axis.
@@ -149,6 +153,15 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
     const Eigen::Vector3d d = b.cylinder.point - a.cylinder.point;
     const double s = d.dot(a.cylinder.axis), cosine = b.cylinder.axis.dot(a.cylinder.axis);
     return std::minmax({s + cosine * b.s_min_m, s + cosine * b.s_max_m});
+  };
+  // Neither end of `thin` leaves the cylinder of this radius round the line of `thick`.
+  const auto stays_inside = [](const Landmark& thin, const Landmark& thick, double radius) {
+    for (const double s : {thin.s_min_m, thin.s_max_m}) {
+      const Eigen::Vector3d d =
+          thin.cylinder.point + s * thin.cylinder.axis - thick.cylinder.point;
+      if ((d - d.dot(thick.cylinder.axis) * thick.cylinder.axis).norm() > radius) return false;
+    }
+    return true;
   };
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
     for (std::size_t j = i + 1; j < landmarks.size() && !dropped[i]; ++j) {
@@ -167,6 +180,15 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const double s_b = d.dot(b.cylinder.axis);
       const double offset = (d - s_b * b.cylinder.axis).norm();
       if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
+      const double ra = a.RadiusAt(middle), rb = b.RadiusAt(s_b);
+      const bool a_thin = ra < rb;
+      if (std::max(ra, rb) > kSameWoodRatio * std::min(ra, rb) &&
+          std::abs(ra - rb) > 2.0 * std::hypot(a.RadiusSigmaAt(middle), b.RadiusSigmaAt(s_b)) &&
+          end - begin > kSameWoodShare * std::min(length(a), length(b)) &&
+          stays_inside(a_thin ? a : b, a_thin ? b : a, std::max(ra, rb))) {
+        dropped[a.num_scans < b.num_scans ? i : j] = true;
+        continue;
+      }
       // What is left of each when cut in the middle of the common stretch.
       const bool b_above = on_a.first + on_a.second > a.s_min_m + a.s_max_m;
       const bool a_above = on_b.first + on_b.second > b.s_min_m + b.s_max_m;

@@ -32,6 +32,8 @@ constexpr double kForkRadiusRatio = 1.6;
 // unless that costs this much more.
 constexpr double kSiblingRadii = 1.5;
 constexpr double kSiblingExtraCost = 1.0;
+// Largest step of the radius in an elbow.
+constexpr double kElbowRadiusRatio = 1.25;
 // Two pieces that run the same way to within this, their axes closer than this part of their radii's
 // sum, fill the same space.
 constexpr double kSameWayDeg = 15.0;
@@ -262,16 +264,34 @@ bool GapIsBlocked(const std::vector<Piece>& pieces, const Joint& joint) {
   return false;
 }
 
+// True when two pieces of equal thickness meet at these ends like the halves of an elbow: their axes
+// pass each other closely, and neither runs on beyond the other by more than its fit may overshoot.
+bool IsElbow(const Piece& a, int e, const Piece& b, int f, const TopologyConfig& config) {
+  const double radius = std::max(a.radius[e], b.radius[f]);
+  if (radius > kElbowRadiusRatio * std::min(a.radius[e], b.radius[f])) return false;
+  const ClosestPoints closest = ClosestOfSegments(a.end[e] + radius * a.Outward(e),
+                                                  a.end[1 - e],
+                                                  b.end[f] + radius * b.Outward(f),
+                                                  b.end[1 - f]);
+  const auto meets_near_its_end = [&](double s, const Piece& piece) {
+    const double overshoot = s * (piece.length + radius) - radius;
+    return overshoot <= std::min(1.5 * radius + config.join_offset_m, 0.6 * piece.length);
+  };
+  return closest.distance <= config.join_offset_m + 0.2 * radius &&
+         meets_near_its_end(closest.s, a) && meets_near_its_end(closest.t, b);
+}
+
 // Pairs of ends that could continue each other, cheapest first.
 std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyConfig& config) {
   std::vector<Joint> joints;
   const double cos_bend = std::cos(config.join_angle_deg * kDeg);
+  const double cos_elbow = std::cos(config.join_elbow_deg * kDeg);
   const int n = static_cast<int>(pieces.size());
   for (int i = 0; i < n; ++i) {
     for (int j = i + 1; j < n; ++j) {
       const Piece& a = pieces[i];
       const Piece& b = pieces[j];
-      if (std::abs(a.landmark->cylinder.axis.dot(b.landmark->cylinder.axis)) < cos_bend) continue;
+      if (std::abs(a.landmark->cylinder.axis.dot(b.landmark->cylinder.axis)) < cos_elbow) continue;
       // No end of one is anywhere near an end of the other.
       const double far = config.join_gap_m + config.join_offset_m + 1.0 + a.length + b.length;
       if ((a.landmark->cylinder.point - b.landmark->cylinder.point).squaredNorm() > 4.0 * far * far)
@@ -280,16 +300,21 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
         for (int f = 0; f < 2; ++f) {
           const Vector3d u = a.Outward(e), v = b.Outward(f);
           const double cosine = -u.dot(v);
-          if (cosine < cos_bend) continue;
+          if (cosine < cos_elbow) continue;
+          const bool elbow = cosine < cos_bend;
+          if (elbow && !IsElbow(a, e, b, f, config)) continue;
           const Vector3d gap = b.end[f] - a.end[e];
           const Vector3d direction = (u - v).normalized();
           const double along = gap.dot(direction);
           const double overlap_allowed = 0.5 * std::min(a.length, b.length);
-          if (along > config.join_gap_m || along < -overlap_allowed) continue;
           const double sideways = (gap - along * direction).norm();
           const double ra = a.radius[e], rb = b.radius[f];
           const double open = std::max(along, 0.0);
-          if (sideways > config.join_offset_m + 0.4 * std::min(ra, rb) + 0.15 * open) continue;
+          if (!elbow &&
+              (along > config.join_gap_m || along < -overlap_allowed ||
+               sideways > config.join_offset_m + 0.4 * std::min(ra, rb) + 0.15 * open)) {
+            continue;
+          }
           const double ratio = std::max(ra, rb) / std::min(ra, rb);
           const double radius_sigma = std::hypot(a.sigma[e], b.sigma[f]);
           if (ratio > config.join_radius_ratio && std::abs(ra - rb) > 2.0 * radius_sigma) continue;
@@ -363,6 +388,7 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
   const Piece& stem = pieces[piece];
   const Vector3d direction = stem.Outward(end);
   struct Arm {
+    int piece, end;
     Vector3d away;
     double bend, radius;
   };
@@ -379,9 +405,13 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
       // Its axis, run backwards, comes from this end.
       const double miss = (offset - offset.dot(away) * away).norm();
       if (miss > stem.radius[end] + config.attach_offset_m) continue;
-      arms.push_back({away, bend, pieces[k].radius[f]});
+      arms.push_back({k, f, away, bend, pieces[k].radius[f]});
     }
   }
+  // One arm that goes on from the far end of another is not a second one.
+  const auto goes_on = [&](const Arm& a, const Arm& b) {
+    return IsElbow(pieces[a.piece], 1 - a.end, pieces[b.piece], b.end, config);
+  };
   for (const Arm& a : arms) {
     if (a.bend < kStraightOnDeg * kDeg) return false;
   }
@@ -390,7 +420,7 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
       const double ratio =
           std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
       if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) &&
-          ratio < kForkRadiusRatio) {
+          ratio < kForkRadiusRatio && !goes_on(arms[i], arms[k]) && !goes_on(arms[k], arms[i])) {
         return true;
       }
     }
@@ -764,6 +794,8 @@ void TopologyConfig::Validate() const {
           "min_section_length_m must be from 0 to max_section_length_m");
   require(join_gap_m >= 0.0, "join_gap_m must be >= 0");
   require(join_angle_deg > 0.0 && join_angle_deg < 90.0, "join_angle_deg must be between 0 and 90");
+  require(join_elbow_deg >= join_angle_deg && join_elbow_deg < 90.0,
+          "join_elbow_deg must be from join_angle_deg to 90");
   require(join_offset_m >= 0.0, "join_offset_m must be >= 0");
   require(join_radius_ratio > 1.0, "join_radius_ratio must be > 1");
   require(attach_reach_m >= 0.0, "attach_reach_m must be >= 0");

@@ -244,6 +244,31 @@ TEST(SeparatePieces, CutsInTheMiddleOfTheCommonStretchAndDropsWhatLiesWithin) {
   EXPECT_NEAR(out[2].s_max_m, 1.0, 1e-12);
 }
 
+// What was taken for a thin piece in the middle of a thick stem is no wood; a thin branch that leaves the
+// stem at a small angle is.
+TEST(SeparatePieces, DropsAThinPieceInsideAThickOneAndKeepsABranchThatLeavesIt) {
+  const auto piece = [](int id, const Eigen::Vector3d& from, const Eigen::Vector3d& to, double radius, int scans) {
+    Landmark l;
+    l.id = id;
+    l.cylinder.axis = (to - from).normalized();
+    l.cylinder.point = 0.5 * (from + to);
+    l.cylinder.curvature = 1.0 / radius;
+    l.s_max_m = 0.5 * (to - from).norm();
+    l.s_min_m = -l.s_max_m;
+    l.profile = {{0.0, radius, 0.002, 10}};
+    l.covariance = 1e-4 * Matrix5d::Identity();
+    l.num_scans = scans;
+    l.confirmed = true;
+    return l;
+  };
+  const Landmark stem = piece(0, {0, 0, 0}, {0, 0, 2}, 0.18, 250);
+  const std::vector<Landmark> inside = SeparatePieces({stem, piece(1, {-0.07, -0.1, 1}, {-0.1, 0.08, 2.5}, 0.105, 14)});
+  ASSERT_EQ(inside.size(), 1u);
+  EXPECT_EQ(inside[0].id, 0);
+  EXPECT_NEAR(inside[0].s_max_m, 1.0, 1e-12);  // Nor is the stem cut by it.
+  EXPECT_EQ(SeparatePieces({stem, piece(1, {0.05, 0, 1.4}, {0.35, 0, 2.6}, 0.06, 60)}).size(), 2u);
+}
+
 TEST(LevelFactors, JacobiansMatchCentralDifferences) {
   std::mt19937 rng(5);
   for (int i = 0; i < 20; ++i) {

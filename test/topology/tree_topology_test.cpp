@@ -403,6 +403,31 @@ TEST(TreeTopology, CurvedBranchIsOneBranch) {
   EXPECT_LT(branch.base.z(), branch.tip.z());
 }
 
+TEST(TreeTopology, AnElbowIsOneBranch) {
+  // A saguaro's arms as they were mapped: out of the trunk at 55 degrees, up within a metre, in pieces
+  // that run into each other; each as thick as it began.
+  const std::vector<Landmark> landmarks = {
+      MakeLandmark(0, {0, 0, 0}, {0, 0, 2.7}, 0.25, 0.246),
+      MakeLandmark(1, {0, 0, 2.7}, {0, 0, 3.9}, 0.246, 0.225),
+      MakeLandmark(2, {0, 0, 4.1}, {0, 0, 6.0}, 0.195, 0.165),
+      MakeLandmark(3, {0.02, 0, 3.2}, {-0.75, -0.15, 3.75}, 0.18, 0.175),
+      MakeLandmark(4, {-0.49, -0.1, 3.42}, {-0.65, -0.12, 3.94}, 0.17, 0.17),
+      MakeLandmark(5, {-0.65, -0.12, 3.94}, {-0.65, -0.12, 5.4}, 0.167, 0.163),
+      MakeLandmark(6, {0.09, 0, 2.85}, {0.83, 0.02, 3.44}, 0.2, 0.212),
+      MakeLandmark(7, {0.59, 0.01, 3.07}, {0.74, 0.03, 3.69}, 0.228, 0.21),
+      MakeLandmark(8, {0.72, 0.03, 3.69}, {0.73, 0.03, 5.5}, 0.214, 0.213)};
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0);
+  ExpectConsistent(model);
+  ASSERT_EQ(model.branches.size(), 3u);
+  for (const auto& [first, last] : {std::pair(0, 2), std::pair(3, 5), std::pair(6, 8)}) {
+    for (int id = first; id <= last; ++id) {
+      EXPECT_EQ(BranchOf(model, id).id, BranchOf(model, first).id) << "landmark " << id;
+      EXPECT_EQ(BranchOf(model, id).order, first == 0 ? 0 : 1) << "landmark " << id;
+    }
+  }
+}
+
 TEST(TreeTopology, SeveralTreesAndAPieceOnItsOwn) {
   std::vector<Landmark> landmarks = SmallTree();
   for (const Landmark& landmark : SmallTree()) {
