@@ -117,6 +117,53 @@ Cone Cone::Retract(const Vector6d& delta) const {
   return out;
 }
 
+Cone BentCone::Touching(double s, TouchJacobian* jacobian) const {
+  Cone cone;
+  const Eigen::Vector3d moved = s * middle.axis + 0.5 * s * s * bend;
+  cone.axis = (middle.axis + s * bend).normalized();
+  cone.point = middle.point + moved;
+  cone.radius = middle.radius + s * middle.slope;
+  cone.slope = middle.slope;
+  if (jacobian == nullptr) return cone;
+  const Eigen::Matrix<double, 3, 2> basis = PerpendicularBasis(middle.axis);
+  const Eigen::Matrix<double, 3, 2> own = PerpendicularBasis(cone.axis);
+  jacobian->setZero();
+  for (int k = 0; k < 2; ++k) {
+    const Eigen::Vector3d b = basis.col(k);
+    const Eigen::Vector3d turned = b.cross(moved);  // Of the point, when the axis turns about b.
+    const Eigen::Vector3d bent = (0.5 * s * s) * b;
+    jacobian->block<2, 1>(0, k) = own.transpose() * b;
+    jacobian->block<2, 1>(2, k) = own.transpose() * turned;
+    jacobian->block<2, 1>(2, 2 + k) = own.transpose() * b;
+    jacobian->block<2, 1>(0, 6 + k) = own.transpose() * cone.axis.cross(s * b);
+    jacobian->block<2, 1>(2, 6 + k) = own.transpose() * bent;
+    // A shift along the axis changes the radius that is met at a place.
+    (*jacobian)(4, k) = -cone.slope * cone.axis.dot(turned);
+    (*jacobian)(4, 2 + k) = -cone.slope * cone.axis.dot(b);
+    (*jacobian)(4, 6 + k) = -cone.slope * cone.axis.dot(bent);
+  }
+  (*jacobian)(4, 4) = 1.0;
+  (*jacobian)(4, 5) = s;
+  (*jacobian)(5, 5) = 1.0;
+  return cone;
+}
+
+double BentCone::StationOf(const Eigen::Vector3d& origin, const Eigen::Vector3d& direction) const {
+  const Eigen::Vector3d v = origin - middle.point;
+  const double c = direction.dot(middle.axis);
+  const double m2 = 1.0 - c * c;
+  if (!(m2 > 1e-6)) return 0.0;
+  return (v.dot(middle.axis) - c * v.dot(direction)) / m2;
+}
+
+BentCone BentCone::Retract(const Tangent& delta) const {
+  const Eigen::Matrix<double, 3, 2> basis = PerpendicularBasis(middle.axis);
+  BentCone out;
+  out.middle = middle.Retract(delta.head<6>());
+  out.bend = ExpSo3(basis * delta.head<2>()) * (bend + basis * delta.tail<2>());
+  return out;
+}
+
 Footprint FootprintOnCone(const Eigen::Vector3d& axis,
                           const Eigen::Vector3d& direction,
                           const Eigen::Vector3d& spin_axis,

@@ -12,6 +12,7 @@
 
 #include "dendro_slam/cylinder_fitting/beam_model.h"
 #include "dendro_slam/cylinder_fitting/marshall_fit.h"
+#include "dendro_slam/geometry/cylinder.h"
 
 namespace dendro {
 namespace {
@@ -26,14 +27,15 @@ constexpr double kLargestCycle = 25.0;
 // A footprint of thin rays still leaves the silhouette this uncertain a width [m].
 constexpr double kThinnestBeam = 1e-3;
 
-// The state of the final estimator: the cone's tangent space and the error of the share of a beam
-// that makes a return, which shifts all edges by that part of the beam's width.
-constexpr int kStates = 7;
+// The state of the final estimator: the bent cone's tangent space and the error of the share of a
+// beam that makes a return, which shifts all edges by that part of the beam's width.
+constexpr int kStates = 9;
 constexpr int kRadius = 4;
 constexpr int kSlope = 5;
-constexpr int kShare = 6;
-using Vector7d = Eigen::Matrix<double, kStates, 1>;
-using Matrix7d = Eigen::Matrix<double, kStates, kStates>;
+constexpr int kBend = 6;
+constexpr int kShare = 8;
+using StateVector = Eigen::Matrix<double, kStates, 1>;
+using StateMatrix = Eigen::Matrix<double, kStates, kStates>;
 
 void Require(bool ok, const char* field, const char* rule) {
   if (!ok) {
@@ -56,15 +58,15 @@ struct Edge {
 
 // A linear observation `low <= g . x <= high` of the state, whose ends are known to sigma.
 struct Interval {
-  Vector7d g;
+  StateVector g;
   double low, high, sigma;
   // Gaussian message of expectation propagation, in natural parameters of g . x.
   double precision = 0.0, shift = 0.0;
 };
 
 struct Posterior {
-  Vector7d mean = Vector7d::Zero();
-  Matrix7d covariance = Matrix7d::Identity();
+  StateVector mean = StateVector::Zero();
+  StateMatrix covariance = StateMatrix::Identity();
 };
 
 double NormalPdf(double x) { return 0.3989422804014327 * std::exp(-0.5 * x * x); }
@@ -75,18 +77,18 @@ double NormalCdf(double x) { return 0.5 * std::erfc(-x * 0.7071067811865476); }
 // trunk's edges in neighbouring rings) so count once, and brackets that are staggered narrow each
 // other down, which treating each as an independent error of spacing/sqrt(12) would get wrong both
 // ways. An interval may be false (a leaf, a knot) with probability `outlier`.
-Posterior Propagate(const Matrix7d& information,
-                    const Vector7d& vector,
+Posterior Propagate(const StateMatrix& information,
+                    const StateVector& vector,
                     double outlier,
                     std::vector<Interval>* intervals) {
   Posterior out;
-  out.covariance = information.ldlt().solve(Matrix7d::Identity());
+  out.covariance = information.ldlt().solve(StateMatrix::Identity());
   out.mean = out.covariance * vector;
   if (intervals->empty()) return out;
   // Start with every bracket believed, as a uniform error within it; a thin branch's ranges alone
   // may lie so far off that each bracket by itself would look false.
-  Matrix7d precision = information;
-  Vector7d natural = vector;
+  StateMatrix precision = information;
+  StateVector natural = vector;
   for (Interval& i : *intervals) {
     const double half = 0.5 * (i.high - i.low);
     i.precision = 1.0 / (half * half / 3.0 + i.sigma * i.sigma);
@@ -94,12 +96,12 @@ Posterior Propagate(const Matrix7d& information,
     precision += i.precision * i.g * i.g.transpose();
     natural += i.shift * i.g;
   }
-  out.covariance = precision.ldlt().solve(Matrix7d::Identity());
+  out.covariance = precision.ldlt().solve(StateMatrix::Identity());
   out.mean = out.covariance * natural;
   for (int sweep = 0; sweep < 12; ++sweep) {
     double change = 0.0;
     for (Interval& i : *intervals) {
-      const Vector7d Cg = out.covariance * i.g;
+      const StateVector Cg = out.covariance * i.g;
       const double v = i.g.dot(Cg);
       const double m = i.g.dot(out.mean);
       const double cavity_precision = 1.0 / v - i.precision;
@@ -147,7 +149,7 @@ Posterior Propagate(const Matrix7d& information,
       precision += i.precision * i.g * i.g.transpose();
       natural += i.shift * i.g;
     }
-    out.covariance = precision.ldlt().solve(Matrix7d::Identity());
+    out.covariance = precision.ldlt().solve(StateMatrix::Identity());
     out.mean = out.covariance * natural;
     if (change < 1e-4) break;
   }
@@ -155,9 +157,9 @@ Posterior Propagate(const Matrix7d& information,
 }
 
 struct Estimate {
-  Cone cone;
+  BentCone cone;
   double share_error = 0.0;
-  Matrix7d covariance = Matrix7d::Identity();
+  StateMatrix covariance = StateMatrix::Identity();
   std::vector<double> weights;  // Per beam.
   std::vector<double> residuals;
   double sigma = 0.0;           // Scatter along the beam [m].
@@ -206,11 +208,11 @@ class SegmentFit {
     return FootprintOnCone(cone.axis, beam.direction, Eigen::Vector3d::UnitZ(),
                            beam.half_horizontal, beam.half_vertical);
   }
-  void Recentre(Cone* cone, const std::vector<double>& weights) const;
+  void Recentre(BentCone* cone, const std::vector<double>& weights) const;
   void Linearise(Estimate* estimate,
                  bool rescale,
-                 Matrix7d* information,
-                 Vector7d* vector,
+                 StateMatrix* information,
+                 StateVector* vector,
                  std::vector<Interval>* intervals) const;
   Estimate Refine(const Cone& start) const;
   void Report(const Estimate& estimate, FittedCylinder* out) const;
@@ -441,38 +443,39 @@ std::optional<Cone> SegmentFit::Start() const {
 }
 
 // Moves the anchor to the middle of the stretch that holds the returns.
-void SegmentFit::Recentre(Cone* cone, const std::vector<double>& weights) const {
+void SegmentFit::Recentre(BentCone* cone, const std::vector<double>& weights) const {
   double low = std::numeric_limits<double>::infinity(), high = -low;
   for (std::size_t i = 0; i < beams_.size(); ++i) {
     if (!weights.empty() && weights[i] < 0.5) continue;
-    const double s = (beams_[i].point - cone->point).dot(cone->axis);
+    const double s = (beams_[i].point - cone->middle.point).dot(cone->middle.axis);
     low = std::min(low, s);
     high = std::max(high, s);
   }
   if (!(low <= high)) return;
-  const double s = 0.5 * (low + high);
-  cone->point += s * cone->axis;
-  cone->radius += s * cone->slope;
+  cone->middle = cone->Touching(0.5 * (low + high));
+  cone->bend -= cone->bend.dot(cone->middle.axis) * cone->middle.axis;
 }
 
 void SegmentFit::Linearise(Estimate* estimate,
                            bool rescale,
-                           Matrix7d* information,
-                           Vector7d* vector,
+                           StateMatrix* information,
+                           StateVector* vector,
                            std::vector<Interval>* intervals) const {
-  const Cone& cone = estimate->cone;
+  const BentCone& bent = estimate->cone;
   const std::size_t n = beams_.size();
-  std::vector<Vector6d> jacobians(n);
+  std::vector<BentCone::Tangent> jacobians(n);
   estimate->residuals.assign(n, 0.0);
   estimate->weights.assign(n, 0.0);
   std::vector<double> magnitudes;
   for (std::size_t i = 0; i < n; ++i) {
     const Beam& beam = beams_[i];
+    BentCone::TouchJacobian touching;
+    const Cone cone = bent.Touching(bent.StationOf(beam.origin, beam.direction), &touching);
     const BeamOnCone located = LocateBeam(cone, beam.origin, beam.direction);
     if (!located.valid) continue;
     const RangePrediction predicted = PredictRange(located, FootprintOf(cone, beam));
     estimate->residuals[i] = beam.range - predicted.range;
-    jacobians[i] = predicted.jacobian;
+    jacobians[i] = touching.transpose() * predicted.jacobian;
     estimate->weights[i] = 1.0;
     magnitudes.push_back(std::abs(estimate->residuals[i]));
   }
@@ -497,14 +500,14 @@ void SegmentFit::Linearise(Estimate* estimate,
   const double inverse = 1.0 / (estimate->sigma * estimate->sigma);
   const double ring_variance = config_.ring_bias_sigma_m * config_.ring_bias_sigma_m;
   // A laser's offset is common to its ring: sigma^2 I + b^2 1 1^T per ring, inverted by Woodbury.
-  Vector6d ring_jacobian = Vector6d::Zero();
+  BentCone::Tangent ring_jacobian = BentCone::Tangent::Zero();
   double ring_residual = 0.0, ring_weight = 0.0;
   const auto close_ring = [&]() {
     if (ring_variance > 0.0 && ring_weight > 0.0) {
       const double gain =
           ring_variance * inverse * inverse / (1.0 + ring_variance * inverse * ring_weight);
-      information->topLeftCorner<6, 6>() -= gain * ring_jacobian * ring_jacobian.transpose();
-      vector->head<6>() -= gain * ring_residual * ring_jacobian;
+      information->topLeftCorner<8, 8>() -= gain * ring_jacobian * ring_jacobian.transpose();
+      vector->head<8>() -= gain * ring_residual * ring_jacobian;
     }
     ring_jacobian.setZero();
     ring_residual = ring_weight = 0.0;
@@ -513,9 +516,9 @@ void SegmentFit::Linearise(Estimate* estimate,
     if (i > 0 && beams_[i].row != beams_[i - 1].row) close_ring();
     const double w = estimate->weights[i];
     if (w == 0.0) continue;
-    const Vector6d& J = jacobians[i];
-    information->topLeftCorner<6, 6>() += (w * inverse) * J * J.transpose();
-    vector->head<6>() += (w * inverse * estimate->residuals[i]) * J;
+    const BentCone::Tangent& J = jacobians[i];
+    information->topLeftCorner<8, 8>() += (w * inverse) * J * J.transpose();
+    vector->head<8>() += (w * inverse * estimate->residuals[i]) * J;
     ring_jacobian += w * J;
     ring_residual += w * estimate->residuals[i];
     ring_weight += w;
@@ -523,7 +526,11 @@ void SegmentFit::Linearise(Estimate* estimate,
   close_ring();
   const double slope_information = 1.0 / (config_.taper_sigma_m_per_m * config_.taper_sigma_m_per_m);
   (*information)(kSlope, kSlope) += slope_information;
-  (*vector)[kSlope] -= slope_information * cone.slope;
+  (*vector)[kSlope] -= slope_information * bent.middle.slope;
+  const double bend_information = 1.0 / (config_.bend_sigma_per_m * config_.bend_sigma_per_m);
+  information->diagonal().segment<2>(kBend).array() += bend_information;
+  vector->segment<2>(kBend) -=
+      bend_information * PerpendicularBasis(bent.middle.axis).transpose() * bent.bend;
   const double share_information =
       1.0 / (config_.detection_bias_sigma * config_.detection_bias_sigma);
   (*information)(kShare, kShare) += share_information;
@@ -536,6 +543,9 @@ void SegmentFit::Linearise(Estimate* estimate,
   intervals->clear();
   estimate->edges = estimate->edges_violated = 0;
   for (const Edge& edge : edges_) {
+    BentCone::TouchJacobian touching;
+    const Cone cone =
+        bent.Touching(bent.StationOf(edge.hit.origin, edge.hit.direction), &touching);
     const BeamOnCone hit = LocateBeam(cone, edge.hit.origin, edge.hit.direction);
     const BeamOnCone miss = LocateBeam(cone, edge.miss.origin, edge.miss.direction);
     if (!hit.valid || !miss.valid) continue;
@@ -555,9 +565,9 @@ void SegmentFit::Linearise(Estimate* estimate,
     // Both beams see the same crossing; the mean of the two distances moves with the state.
     Interval interval;
     interval.g.setZero();
-    interval.g.head<6>() =
-        0.5 * (hit_Y * hit.d_silhouette - side * hit.d_offset + miss_Y * miss.d_silhouette -
-               side * miss.d_offset);
+    const Vector6d moved = 0.5 * (hit_Y * hit.d_silhouette - side * hit.d_offset +
+                                  miss_Y * miss.d_silhouette - side * miss.d_offset);
+    interval.g.head<8>() = touching.transpose() * moved;
     interval.g[kShare] = beam_width;
     const double shift = beam_width * estimate->share_error;
     const double low = side * hit.offset - hit_edge - shift;
@@ -577,10 +587,10 @@ void SegmentFit::Linearise(Estimate* estimate,
 Estimate SegmentFit::Refine(const Cone& start) const {
   constexpr double kOutlier = 0.02;
   Estimate estimate;
-  estimate.cone = start;
+  estimate.cone.middle = start;
   Recentre(&estimate.cone, {});
-  Matrix7d information;
-  Vector7d vector;
+  StateMatrix information;
+  StateVector vector;
   std::vector<Interval> intervals;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
     Linearise(&estimate, iteration < kSettling, &information, &vector, &intervals);
@@ -588,15 +598,15 @@ Estimate SegmentFit::Refine(const Cone& start) const {
         Propagate(information, vector, kOutlier, &intervals);
     if (!posterior.mean.allFinite() || !posterior.covariance.allFinite()) return estimate;
     estimate.covariance = posterior.covariance;
-    Vector7d step = posterior.mean;
+    StateVector step = posterior.mean;
     const double statistical = step.dot(posterior.covariance.ldlt().solve(step));
     // Returns at the very limb enter and leave: shorter steps end such a cycle.
     double shrink = iteration < 2 * kSettling ? 1.0 : 0.5;
     shrink = std::min(shrink, 0.3 / std::max(1e-12, step.head<2>().norm()));
     shrink = std::min(shrink, 0.3 / std::max(1e-12, step.segment<2>(2).norm()));
-    shrink = std::min(shrink, 0.4 * estimate.cone.radius / std::max(1e-12, std::abs(step[kRadius])));
+    shrink = std::min(shrink, 0.4 * estimate.cone.middle.radius / std::max(1e-12, std::abs(step[kRadius])));
     step *= shrink;
-    estimate.cone = estimate.cone.Retract(step.head<6>());
+    estimate.cone = estimate.cone.Retract(step.head<8>());
     estimate.share_error += step[kShare];
     if (iteration < kSettling) Recentre(&estimate.cone, estimate.weights);
     if (iteration >= kSettling && statistical < kConverged) {
@@ -614,20 +624,8 @@ Estimate SegmentFit::Refine(const Cone& start) const {
 }
 
 void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
-  const Cone& cone = estimate.cone;
-  out->cylinder.axis = cone.axis;
-  out->cylinder.point = cone.point;
-  out->cylinder.curvature = 1.0 / cone.radius;
-  Matrix5d to_cylinder = Matrix5d::Identity();
-  to_cylinder(4, 4) = -1.0 / (cone.radius * cone.radius);
-  out->covariance =
-      to_cylinder * estimate.covariance.topLeftCorner<5, 5>() * to_cylinder.transpose();
-  out->covariance = 0.5 * (out->covariance + out->covariance.transpose()).eval();
-  out->taper_m_per_m = cone.slope;
-  out->taper_sigma_m_per_m = std::sqrt(estimate.covariance(kSlope, kSlope));
-  out->taper_estimated = out->taper_sigma_m_per_m < 0.5 * config_.taper_sigma_m_per_m;
-  if (!out->taper_estimated) out->taper_m_per_m = 0.0;
-
+  const BentCone& bent = estimate.cone;
+  const Cone& cone = bent.middle;
   double low = std::numeric_limits<double>::infinity(), high = -low;
   double arc_low = low, arc_high = -low;
   double deviation = 0.0;
@@ -642,7 +640,8 @@ void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
     const double s = (beam.point - cone.point).dot(cone.axis);
     low = std::min(low, s);
     high = std::max(high, s);
-    const BeamOnCone located = LocateBeam(cone, beam.origin, beam.direction);
+    const BeamOnCone located = LocateBeam(bent.Touching(bent.StationOf(beam.origin, beam.direction)),
+                                          beam.origin, beam.direction);
     if (!located.valid) continue;
     const double angle = std::asin(std::clamp(located.offset / located.silhouette, -1.0, 1.0));
     arc_low = std::min(arc_low, angle);
@@ -654,9 +653,26 @@ void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
     out->mean_abs_deviation_m = deviation / out->num_points;
     out->visible_arc_rad = std::max(0.0, arc_high - arc_low);
   }
-  out->distance_m = (cone.point - origin_).norm();
+
+  // The straight line with the least mean square distance from the bent axis: half of the mean of s^2.
+  const double lift = out->num_points > 0 ? (low * low + low * high + high * high) / 6.0 : 0.0;
+  out->cylinder.axis = cone.axis;
+  out->cylinder.point = cone.point + lift * bent.bend;
+  out->cylinder.curvature = 1.0 / cone.radius;
+  Eigen::Matrix<double, 5, kStates> to_cylinder = Eigen::Matrix<double, 5, kStates>::Zero();
+  to_cylinder.leftCols<4>().setIdentity();
+  to_cylinder.block<2, 2>(2, kBend) = lift * Eigen::Matrix2d::Identity();
+  to_cylinder(4, kRadius) = -1.0 / (cone.radius * cone.radius);
+  out->covariance = to_cylinder * estimate.covariance * to_cylinder.transpose();
+  out->covariance = 0.5 * (out->covariance + out->covariance.transpose()).eval();
+  out->taper_m_per_m = cone.slope;
+  out->taper_sigma_m_per_m = std::sqrt(estimate.covariance(kSlope, kSlope));
+  out->taper_estimated = out->taper_sigma_m_per_m < 0.5 * config_.taper_sigma_m_per_m;
+  if (!out->taper_estimated) out->taper_m_per_m = 0.0;
+
+  out->distance_m = (out->cylinder.point - origin_).norm();
   // The true end lies anywhere up to the next beam along the axis.
-  const Eigen::Vector3d view = (cone.point - origin_).normalized();
+  const Eigen::Vector3d view = (out->cylinder.point - origin_).normalized();
   const Eigen::Vector3d across = Eigen::Vector3d::UnitZ().cross(view);
   const double level = std::min(1.0, std::abs(cone.axis.dot(across.normalized())));
   const double steep = std::sqrt(std::max(0.0, 1.0 - level * level));
@@ -703,22 +719,22 @@ FittedCylinder SegmentFit::Fit() {
 
   Estimate estimate;
   if (config_.marshall_only) {
-    estimate.cone = *start;
+    estimate.cone.middle = *start;
     Recentre(&estimate.cone, {});
-    Matrix7d information;
-    Vector7d vector;
+    StateMatrix information;
+    StateVector vector;
     std::vector<Interval> intervals;
     Linearise(&estimate, true, &information, &vector, &intervals);
-    estimate.covariance = information.ldlt().solve(Matrix7d::Identity());
+    estimate.covariance = information.ldlt().solve(StateMatrix::Identity());
     estimate.edges = estimate.edges_violated = 0;
     estimate.converged = true;
   } else {
     CollectEdges();
     estimate = Refine(*start);
   }
-  const double r = estimate.cone.radius;
-  const bool finite = estimate.cone.axis.allFinite() && estimate.cone.point.allFinite() &&
-                      std::isfinite(r) && estimate.covariance.allFinite();
+  const double r = estimate.cone.middle.radius;
+  const bool finite = estimate.cone.middle.axis.allFinite() &&
+                      estimate.cone.middle.point.allFinite() && std::isfinite(r) && estimate.covariance.allFinite();
   if (!finite) return unresolved(UnresolvedReason::kNotConverged);
   if (!(r >= config_.min_radius_m) || !(r <= config_.max_radius_m)) {
     return unresolved(UnresolvedReason::kRadiusOutOfRange);
@@ -763,6 +779,7 @@ void CylinderFitterConfig::Validate() const {
   Require(positive(range_sigma_m), "range_sigma_m", "> 0");
   Require(not_negative(range_sigma_weight), "range_sigma_weight", ">= 0");
   Require(positive(taper_sigma_m_per_m), "taper_sigma_m_per_m", "> 0");
+  Require(positive(bend_sigma_per_m), "bend_sigma_per_m", "> 0");
   Require(not_negative(beam_exit_horizontal_m), "beam_exit_horizontal_m", ">= 0");
   Require(not_negative(beam_exit_vertical_m), "beam_exit_vertical_m", ">= 0");
   Require(not_negative(beam_divergence_horizontal_rad), "beam_divergence_horizontal_rad", ">= 0");

@@ -6,6 +6,7 @@
 #include <gtest/gtest.h>
 
 #include "cone_scan.h"
+#include "dendro_slam/geometry/cylinder.h"
 
 namespace dendro {
 namespace {
@@ -97,6 +98,51 @@ TEST(LocateBeam, JacobiansMatchCentralDifferences) {
               1e-6);
     EXPECT_LT((beam.d_sin_angle - Numeric(c, [&](const Cone& k) { return at(k).sin_angle; })).norm(),
               1e-6);
+  }
+}
+
+TEST(BentCone, TouchesItsAxisAndIsTheConeWithoutABend) {
+  BentCone bent;
+  bent.middle.point = {4.0, 0.5, 1.0};
+  bent.middle.radius = 0.1;
+  bent.middle.slope = -0.02;
+  EXPECT_LT((bent.Touching(0.7).point - Vector3d(4.0, 0.5, 1.7)).norm(), 1e-12);
+  EXPECT_NEAR(bent.Touching(0.7).radius, 0.1 - 0.02 * 0.7, 1e-12);
+  bent.bend = {0.0, 0.2, 0.0};  // A sagitta of 2.5 cm on a metre.
+  EXPECT_LT((bent.Touching(0.5).point - Vector3d(4.0, 0.525, 1.5)).norm(), 1e-12);
+  EXPECT_LT((bent.Touching(0.5).axis - Vector3d(0.0, 0.1, 1.0).normalized()).norm(), 1e-12);
+  EXPECT_NEAR(bent.StationOf(Vector3d::Zero(), Vector3d(4.0, 0.5, 1.3).normalized()), 0.3, 1e-9);
+}
+
+TEST(BentCone, JacobianMatchesCentralDifferences) {
+  std::mt19937 rng(11);
+  std::uniform_real_distribution<double> u(-1.0, 1.0);
+  for (int i = 0; i < 100; ++i) {
+    const Case c = RandomCase(&rng);
+    BentCone bent;
+    bent.middle = c.cone;
+    bent.bend = 0.2 * (u(rng) * PerpendicularBasis(c.cone.axis).col(0) +
+                       u(rng) * PerpendicularBasis(c.cone.axis).col(1));
+    const double s = 0.8 * u(rng);
+    BentCone::TouchJacobian touching;
+    const BeamOnCone beam = LocateBeam(bent.Touching(s, &touching), c.origin, c.direction);
+    ASSERT_TRUE(beam.valid);
+    BentCone::Tangent offset, silhouette;
+    constexpr double kStep = 1e-6;
+    for (int k = 0; k < 8; ++k) {
+      BentCone::Tangent d = BentCone::Tangent::Zero();
+      d[k] = kStep;
+      const BeamOnCone plus =
+          LocateBeam(bent.Retract(d).Touching(s), c.origin, c.direction);
+      const BeamOnCone minus =
+          LocateBeam(bent.Retract(-d).Touching(s), c.origin, c.direction);
+      offset[k] = (plus.offset - minus.offset) / (2.0 * kStep);
+      silhouette[k] = (plus.silhouette - minus.silhouette) / (2.0 * kStep);
+    }
+    // (s bend)^2 is left out: the axis' length along a bend.
+    EXPECT_LT((touching.transpose() * beam.d_offset - offset).norm(), 0.02 * offset.norm());
+    EXPECT_LT((touching.transpose() * beam.d_silhouette - silhouette).norm(),
+              0.02 * silhouette.norm() + 1e-3);
   }
 }
 

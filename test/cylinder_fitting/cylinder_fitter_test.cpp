@@ -140,6 +140,49 @@ TEST(CylinderFitter, TaperIsFoundOnALongTrunk) {
   EXPECT_NEAR(fit.cylinder.radius(), 0.24 - 0.09 * s, 0.003);
 }
 
+// A branch of 2.5 cm that sags by more than its radius: a straight cylinder has to cover the bow.
+TEST(CylinderFitter, BentBranchHasTheRadiusOfAStraightOne) {
+  constexpr double kRadius = 0.025, kBend = 0.3, kHalf = 0.55;
+  const Vector3d along = Vector3d(0.1, 0.6, 0.8).normalized();
+  const Vector3d sag = Vector3d::UnitX().cross(along).normalized();
+  const CylinderFitter fitter;
+  CylinderFitterConfig stiff_config;
+  stiff_config.bend_sigma_per_m = 1e-3;
+  const CylinderFitter stiff(stiff_config);
+  double sum = 0.0, stiff_sum = 0.0;
+  int n = 0, within = 0;
+  for (unsigned seed = 1; seed <= 12; ++seed) {
+    const Vector3d centre(3.5, 0.2 * seed - 1.0, 0.3);
+    std::vector<TestCone> chain;
+    constexpr int kPieces = 8;
+    const auto at = [&](int i) {
+      const double s = kHalf * (2.0 * i / kPieces - 1.0);
+      return Vector3d(centre + s * along + 0.5 * kBend * s * s * sag);
+    };
+    for (int i = 0; i < kPieces; ++i) chain.push_back({at(i), at(i + 1), kRadius, kRadius});
+    TestSensor sensor;
+    sensor.azimuth_offset_deg = 0.0371 * seed;
+    const TestScan test = SimulateCones(chain, sensor, seed);
+    Segment segment;
+    for (std::size_t i = 0; i < test.truth.size(); ++i) {
+      if (test.truth[i] >= 0) segment.pixels.push_back(static_cast<std::int32_t>(i));
+    }
+    const FittedCylinder fit = fitter.FitSegment(test.scan, segment);
+    if (fit.status != FitStatus::kMeasured) continue;
+    ++n;
+    sum += fit.cylinder.radius() - kRadius;
+    within += std::abs(fit.cylinder.radius() - kRadius) < 2.0 * fit.radius_sigma_m();
+    stiff_sum += stiff.FitSegment(test.scan, segment).cylinder.radius() - kRadius;
+    // The line lies amid the branch.
+    const Vector3d mean = centre + kBend * kHalf * kHalf / 6.0 * sag;
+    EXPECT_LT((fit.cylinder.point - mean).cross(along).norm(), 0.012);
+  }
+  ASSERT_GE(n, 10);
+  EXPECT_LT(std::abs(sum / n), 0.03 * kRadius);
+  EXPECT_GE(within, n - 2);
+  EXPECT_GT(stiff_sum / n, 0.08 * kRadius);
+}
+
 TEST(CylinderFitter, AcrossTheColumnSeam) {
   // The same trunk ahead (columns 0 and 1799 both on it) and turned by a whole number of columns.
   const TestScan seam = SimulateCones({Upright(4.0, 0.0, 0.15)}, TestSensor(), 3);

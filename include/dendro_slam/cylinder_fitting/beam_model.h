@@ -21,6 +21,25 @@ struct Cone {
   Cone Retract(const Vector6d& delta) const;
 };
 
+/// A cone whose axis is a parabola: at arc length s from the anchor it runs through
+/// `point + s axis + s^2/2 bend` along `axis + s bend`.
+///
+/// Tangent space (8): that of Cone, then `[bend (2, 1/m)]` in the same basis across the axis.
+struct BentCone {
+  Cone middle;                                     ///< The cone that touches it at the anchor.
+  Eigen::Vector3d bend = Eigen::Vector3d::Zero();  ///< Second derivative of the axis [1/m].
+
+  using Tangent = Eigen::Matrix<double, 8, 1>;
+  /// Derivative of a touching cone's tangent vector by the bent cone's.
+  using TouchJacobian = Eigen::Matrix<double, 6, 8>;
+
+  /// The straight cone that touches it at station s [m].
+  Cone Touching(double s, TouchJacobian* jacobian = nullptr) const;
+  /// Station where a beam passes the axis of the middle [m]; 0 for a beam along it.
+  double StationOf(const Eigen::Vector3d& origin, const Eigen::Vector3d& direction) const;
+  BentCone Retract(const Tangent& delta) const;
+};
+
 /// A beam's cross-section as one cone sees it: the beam is a rectangle of even energy, of which only
 /// the projection on the direction across the axis matters to first order. That projection is a
 /// trapezoid: flat to |half_width - half_slope|, zero beyond half_width + half_slope.

@@ -25,6 +25,7 @@ struct CylinderFitterConfig {
   double range_sigma_m = 0.012;       ///< Expected range noise [m]. > 0.
   double range_sigma_weight = 8.0;    ///< Worth of that expectation, in returns. >= 0.
   double taper_sigma_m_per_m = 0.02;  ///< Prior of dr/ds [m/m]. > 0.
+  double bend_sigma_per_m = 0.15;     ///< Prior of the axis' curvature, in each direction [1/m]. > 0.
 
   double beam_exit_horizontal_m = 0.0095;      ///< Width of the beam as it leaves [m]. >= 0.
   double beam_exit_vertical_m = 0.0127;        ///< Height of the beam as it leaves [m]. >= 0.
@@ -50,6 +51,7 @@ struct CylinderFitterConfig {
     v("range_sigma_m", range_sigma_m);
     v("range_sigma_weight", range_sigma_weight);
     v("taper_sigma_m_per_m", taper_sigma_m_per_m);
+    v("bend_sigma_per_m", bend_sigma_per_m);
     v("beam_exit_horizontal_m", beam_exit_horizontal_m);
     v("beam_exit_vertical_m", beam_exit_vertical_m);
     v("beam_divergence_horizontal_rad", beam_divergence_horizontal_rad);
@@ -71,7 +73,9 @@ struct CylinderFitterConfig {
 /// eq. 4.2 with its missing `+ rho`) on five free parameters, and the result is finished with what
 /// the sensor really measures: the range along the beam, averaged over the part of the footprint
 /// that meets the surface, and the silhouette bracketed by the last beam that hits and the first
-/// that misses. A segment that cannot hold a radius is UNRESOLVED with the reason.
+/// that misses. The axis may bend and the radius taper; the cylinder reported has the radius of the
+/// middle and the straight line amid the bent axis. A segment that cannot hold a radius is UNRESOLVED
+/// with the reason.
 ///
 /// @note Deviates: the thesis stops at eq. 4.2, which is biased by several per cent (one-sided
 ///       view, noise along the beam, a footprint wider than the column spacing).
