@@ -506,13 +506,16 @@ void BayesTree::SolveClique(const Clique& clique, double* x) const {
 Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const {
   // The paths to the root, deepest cliques first.
   std::vector<std::pair<int, int>> path;  // (-depth, clique)
-  std::vector<char> seen(cliques_.size(), 0);
+  std::vector<int> depth_of(cliques_.size(), -1);
+  std::vector<int> climbed;
   for (const int v : selected) {
-    for (int c = graph_->states[v].clique; c >= 0 && !seen[c]; c = cliques_[c].parent) {
-      seen[c] = 1;
-      int depth = 0;
-      for (int p = cliques_[c].parent; p >= 0; p = cliques_[p].parent) ++depth;
-      path.emplace_back(-depth, c);
+    climbed.clear();
+    int c = graph_->states[v].clique;
+    for (; c >= 0 && depth_of[c] < 0; c = cliques_[c].parent) climbed.push_back(c);
+    int depth = c >= 0 ? depth_of[c] + 1 : 0;
+    for (auto it = climbed.rbegin(); it != climbed.rend(); ++it, ++depth) {
+      depth_of[*it] = depth;
+      path.emplace_back(-depth, *it);
     }
   }
   std::sort(path.begin(), path.end());

@@ -104,11 +104,15 @@ class IncrementalSolver::Impl {
   Values Estimates() const;
   bool Contains(Key key) const { return slots_.count(key) != 0; }
   Eigen::MatrixXd JointMarginalCovariance(const std::vector<Key>& keys) const;
+  std::vector<Eigen::MatrixXd> PairMarginalCovariances(Key first, const std::vector<Key>& others) const;
   double Error() const { return std::accumulate(error_sums_.begin(), error_sums_.end(), 0.0); }
   double FactorError(FactorId id) const { return errors_[FactorSlot(id)]; }
   const FactorPtr& GetFactor(FactorId id) const { return graph_.factors[FactorSlot(id)].factor; }
   bool ContainsFactor(FactorId id) const { return FindFactor(id) >= 0; }
   std::vector<FactorId> FactorsOf(Key key) const;
+  int NumFactorsOf(Key key) const {
+    return static_cast<int>(graph_.variables[SlotOf(key)].factors.size());
+  }
   int num_variables() const { return static_cast<int>(slots_.size()); }
   int num_factors() const { return num_factors_; }
   const SolverConfig& config() const { return config_; }
@@ -159,10 +163,12 @@ class IncrementalSolver::Impl {
   void RestoreTree();
   [[noreturn]] void ThrowUnderconstrained(int slot) const;
   UpdateResult Iterate(double tolerance, int max_iterations, UpdateResult result);
+  Eigen::MatrixXd TangentAtEstimate(int slot) const;
+  void TakeOutDamping() const;
 
   SolverConfig config_;
   GraphStore graph_;
-  BayesTree tree_;
+  mutable BayesTree tree_;  // Marginals take damping out of it.
   std::vector<double> errors_;  // Per factor slot, at the estimate; 0 in free slots.
   std::vector<double> error_sums_;       // Per block of kErrorBlock factor slots.
   std::vector<char> error_block_stale_;  // Its sum is to be taken again, by TotalError.
@@ -176,7 +182,9 @@ class IncrementalSolver::Impl {
   int epoch_ = 0;
   int last_reorder_ = 0;
   double lambda_ = 0.0;
-  std::vector<int> damped_variables_;  // Eliminated with damping: again at the next update.
+  // Eliminated with damping: again at the next update, or for the next marginal.
+  mutable std::vector<int> damped_variables_;
+  Damping damping_;  // What they were eliminated with.
   // Work space.
   std::vector<double> weights_;
   std::vector<int> groups_;
@@ -855,9 +863,11 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
     // Steps, with damping once one was refused.
     std::vector<int> touched;
     bool damped = lambda_ > 0.0;
+    double factorized_with = lambda_;
     Step& step = step_;
     for (result.iterations = 1;; ++result.iterations) {
       if (lambda_ > 0.0) ComputeWeights();
+      factorized_with = lambda_;
       const int failed = tree_.Factorize({lambda_, &weights_});
       if (failed >= 0) ThrowUnderconstrained(failed);
       if (result.iterations == 1) {
@@ -918,6 +928,7 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       for (const int c : touched) tree_.MarkDirty(c);
     }
     if (damped) {
+      damping_ = {factorized_with, &weights_};
       for (const int c : tree_.factorized()) {
         for (int i = 0; i < tree_.clique(c).num_frontal; ++i) {
           damped_variables_.push_back(tree_.clique(c).variables[i]);
@@ -1143,24 +1154,74 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
   return result.new_factor_ids.empty() ? 0 : result.new_factor_ids.front();
 }
 
+// A covariance is that of the measurements: damping is none.
+void IncrementalSolver::Impl::TakeOutDamping() const {
+  if (damped_variables_.empty()) return;
+  const auto mark = [this] {
+    for (const int v : damped_variables_) {
+      if (graph_.variables[v].alive && graph_.states[v].clique >= 0) {
+        tree_.MarkDirty(graph_.states[v].clique);
+      }
+    }
+  };
+  mark();
+  const int failed = tree_.Factorize({});
+  if (failed >= 0) {
+    // Only the damping made it solvable: there is no covariance.
+    mark();
+    tree_.Factorize(damping_);
+    ThrowUnderconstrained(failed);
+  }
+  damped_variables_.clear();
+}
+
+// From the tangent space at the linearisation point to the one at the estimate.
+Eigen::MatrixXd IncrementalSolver::Impl::TangentAtEstimate(int slot) const {
+  const VariableRecord& v = graph_.variables[slot];
+  const int d = graph_.states[slot].dimension;
+  double buffer[kMaxTangentDimension * kMaxTangentDimension];
+  LocalCoordinatesJacobian(v.theta, v.estimate, buffer);
+  return Eigen::Map<const Eigen::MatrixXd>(buffer, d, d).inverse();
+}
+
 Eigen::MatrixXd IncrementalSolver::Impl::JointMarginalCovariance(const std::vector<Key>& keys) const {
   std::vector<int> selected;
   for (const Key key : keys) selected.push_back(SlotOf(key));
-  const Eigen::MatrixXd Y = tree_.ForwardSolve(selected);
-  Eigen::MatrixXd covariance = Y.transpose() * Y;
-  // From the tangent space at the linearisation point to the one at the estimate.
-  int row = 0;
+  TakeOutDamping();
+  Eigen::MatrixXd Y = tree_.ForwardSolve(selected);
+  int column = 0;
   for (const int slot : selected) {
-    const VariableRecord& v = graph_.variables[slot];
     const int d = graph_.states[slot].dimension;
-    double buffer[kMaxTangentDimension * kMaxTangentDimension];
-    LocalCoordinatesJacobian(v.theta, v.estimate, buffer);
-    const Eigen::MatrixXd J = Eigen::Map<const Eigen::MatrixXd>(buffer, d, d).inverse();
-    covariance.middleRows(row, d) = (J * covariance.middleRows(row, d)).eval();
-    covariance.middleCols(row, d) = (covariance.middleCols(row, d) * J.transpose()).eval();
-    row += d;
+    Y.middleCols(column, d) *= TangentAtEstimate(slot).transpose();
+    column += d;
   }
+  const Eigen::MatrixXd covariance = Y.transpose() * Y;
   return 0.5 * (covariance + covariance.transpose());
+}
+
+std::vector<Eigen::MatrixXd> IncrementalSolver::Impl::PairMarginalCovariances(
+    Key first, const std::vector<Key>& others) const {
+  std::vector<int> selected{SlotOf(first)};
+  for (const Key key : others) selected.push_back(SlotOf(key));
+  TakeOutDamping();
+  Eigen::MatrixXd Y = tree_.ForwardSolve(selected);
+  const int d_first = graph_.states[selected.front()].dimension;
+  Y.leftCols(d_first) *= TangentAtEstimate(selected.front()).transpose();
+  const Eigen::MatrixXd own = Y.leftCols(d_first).transpose() * Y.leftCols(d_first);
+  std::vector<Eigen::MatrixXd> out;
+  int column = d_first;
+  for (std::size_t i = 1; i < selected.size(); ++i) {
+    const int d = graph_.states[selected[i]].dimension;
+    const Eigen::MatrixXd other = Y.middleCols(column, d) * TangentAtEstimate(selected[i]).transpose();
+    Eigen::MatrixXd joint(d_first + d, d_first + d);
+    joint.topLeftCorner(d_first, d_first) = own;
+    joint.topRightCorner(d_first, d).noalias() = Y.leftCols(d_first).transpose() * other;
+    joint.bottomLeftCorner(d, d_first) = joint.topRightCorner(d_first, d).transpose();
+    joint.bottomRightCorner(d, d).noalias() = other.transpose() * other;
+    out.push_back(0.5 * (joint + joint.transpose()));
+    column += d;
+  }
+  return out;
 }
 
 Values IncrementalSolver::Impl::Estimates() const {
@@ -1224,6 +1285,11 @@ Eigen::MatrixXd IncrementalSolver::JointMarginalCovariance(const std::vector<Key
   return impl_->JointMarginalCovariance(keys);
 }
 
+std::vector<Eigen::MatrixXd> IncrementalSolver::PairMarginalCovariances(
+    Key first, const std::vector<Key>& others) const {
+  return impl_->PairMarginalCovariances(first, others);
+}
+
 double IncrementalSolver::Error() const { return impl_->Error(); }
 double IncrementalSolver::FactorError(FactorId factor) const { return impl_->FactorError(factor); }
 const FactorPtr& IncrementalSolver::GetFactor(FactorId factor) const {
@@ -1233,6 +1299,7 @@ bool IncrementalSolver::ContainsFactor(FactorId factor) const {
   return impl_->ContainsFactor(factor);
 }
 std::vector<FactorId> IncrementalSolver::FactorsOf(Key key) const { return impl_->FactorsOf(key); }
+int IncrementalSolver::NumFactorsOf(Key key) const { return impl_->NumFactorsOf(key); }
 int IncrementalSolver::num_variables() const { return impl_->num_variables(); }
 int IncrementalSolver::num_factors() const { return impl_->num_factors(); }
 const SolverConfig& IncrementalSolver::config() const { return impl_->config(); }

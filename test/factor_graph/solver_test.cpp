@@ -190,6 +190,59 @@ TEST(Solver, MarginalsMatchTheInverseHessian) {
   EXPECT_LT((joint - covariance).norm(), 1e-5 * covariance.norm());
 }
 
+TEST(Solver, PairMarginalsAreThoseOfTheJoint) {
+  const Walk walk = MakeWalk(12, 4, 2);
+  IncrementalSolver solver;
+  for (std::size_t i = 0; i < walk.factors.size(); ++i) solver.Update(walk.factors[i], walk.values[i]);
+  const std::vector<Key> others = {L(0), L(2), X(3)};
+  const std::vector<Eigen::MatrixXd> pairs = solver.PairMarginalCovariances(X(11), others);
+  ASSERT_EQ(pairs.size(), others.size());
+  for (std::size_t i = 0; i < others.size(); ++i) {
+    const Eigen::MatrixXd joint = solver.JointMarginalCovariance({X(11), others[i]});
+    EXPECT_LT((pairs[i] - joint).norm(), 1e-10 * joint.norm());
+  }
+}
+
+// `r = atan(p)` in each coordinate: Newton's step from 2 overshoots, so that it is refused and damped.
+class ArcTangentFactor final : public TypedFactor<Eigen::Vector3d> {
+ public:
+  explicit ArcTangentFactor(Key key) : TypedFactor(NoiseModel::Isotropic(3, 0.1), key) {}
+  void Evaluate(const Value* const* values, double* residual, double* jacobian) const override {
+    const auto& p = std::get<Eigen::Vector3d>(*values[0]);
+    for (int i = 0; i < 3; ++i) residual[i] = std::atan(p[i]);
+    if (jacobian == nullptr) return;
+    Eigen::Map<Eigen::Matrix3d> J(jacobian);
+    J.setZero();
+    for (int i = 0; i < 3; ++i) J(i, i) = 1.0 / (1.0 + p[i] * p[i]);
+  }
+
+ private:
+  const char* Kind() const override { return "arctangent"; }
+};
+
+TEST(Solver, MarginalsAfterARefusedStepAreWithoutItsDamping) {
+  // Linearised where they start: the refused step does not move them.
+  Values values;
+  values.Insert(P(0), Value(Eigen::Vector3d(2.0, 2.2, 2.4)));
+  values.Insert(P(1), Value(Eigen::Vector3d(2.1, 2.0, 1.9)));
+  FactorList factors = {std::make_shared<ArcTangentFactor>(P(0)), std::make_shared<ArcTangentFactor>(P(1))};
+  SolverConfig config;
+  config.lambda_initial = 1.0;
+  config.max_iterations = 20;
+  IncrementalSolver solver(config);
+  const UpdateResult result = solver.Update(factors, values);
+  ASSERT_GT(result.steps_refused, 0);
+  ASSERT_GT(result.damping, 0.0);
+  ASSERT_LT(result.error_after, result.error_before);
+  const Eigen::MatrixXd covariance = DenseHessian(factors, values).inverse();
+  EXPECT_LT((solver.MarginalCovariance(P(0)) - covariance.topLeftCorner<3, 3>()).norm(),
+            1e-9 * covariance.norm());
+  EXPECT_LT((solver.JointMarginalCovariance({P(0), P(1)}) - covariance).norm(), 1e-9 * covariance.norm());
+  // And the run goes on to the optimum as if nobody had asked.
+  solver.Update({}, {});
+  EXPECT_LT(solver.Update({}, {}).error_after, result.error_after);
+}
+
 TEST(Solver, RemovedFactorsLeaveNoTrace) {
   const Walk walk = MakeWalk(15, 4, 3);
   IncrementalSolver solver;

@@ -145,10 +145,16 @@ class IncrementalSolver {
   bool Contains(Key key) const;
 
   /// Marginal covariance of a variable in its tangent coordinates at the estimate (of the last
-  /// linearisation; exact after convergence). @throws UnknownVariableError.
+  /// linearisation; exact after convergence), of the measurements alone: damping of the last step is
+  /// taken out of the factorisation first, so not even this may be called from two threads at once.
+  /// @throws UnknownVariableError; UnderconstrainedError where only damping made the graph solvable.
   Eigen::MatrixXd MarginalCovariance(Key key) const;
   /// Joint marginal covariance, blocks in the order of `keys`.
   Eigen::MatrixXd JointMarginalCovariance(const std::vector<Key>& keys) const;
+
+  /// Joint marginal covariance of `first` and each of `others` alone, in the order of `others`: much
+  /// less work than all of them together.
+  std::vector<Eigen::MatrixXd> PairMarginalCovariances(Key first, const std::vector<Key>& others) const;
 
   /// 1/2 chi2 of the graph at the estimate (robust kernels included).
   double Error() const;
@@ -159,6 +165,9 @@ class IncrementalSolver {
   bool ContainsFactor(FactorId factor) const;
   /// Ids of the factors of a variable, ascending. @throws UnknownVariableError.
   std::vector<FactorId> FactorsOf(Key key) const;
+
+  /// How many they are.
+  int NumFactorsOf(Key key) const;
 
   int num_variables() const;
   int num_factors() const;
