@@ -1,8 +1,10 @@
 #include "dendro_slam/mapping/mapper.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <map>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -86,6 +88,9 @@ void MapperConfig::Validate() const {
   Require(key_frame_distance_m > 0.0, "key_frame_distance_m must be > 0");
   Require(key_frame_angle_deg > 0.0, "key_frame_angle_deg must be > 0");
   Require(key_frame_time_s > 0.0, "key_frame_time_s must be > 0");
+  Require(key_frame_cell_m > 0.0, "key_frame_cell_m must be > 0");
+  Require(key_frames_per_cell >= 0, "key_frames_per_cell must be >= 0");
+  Require(key_frame_window >= 1, "key_frame_window must be >= 1");
   Require(vio_walk_m_per_sqrt_m >= 0.0, "vio_walk_m_per_sqrt_m must be >= 0");
   Require(vio_walk_rad_per_sqrt_m >= 0.0, "vio_walk_rad_per_sqrt_m must be >= 0");
   Require(vio_tilt_walk_rad_per_sqrt_m >= 0.0, "vio_tilt_walk_rad_per_sqrt_m must be >= 0");
@@ -131,7 +136,7 @@ class Mapper::Impl {
   MapperResult AddScan(const MapperInput& input);
   MapperResult AddScanWhileLost(const MapperInput& input);
   std::vector<StampedPose> Trajectory() const;
-  std::vector<LandmarkState> StatesWithMarginals() const;
+  std::vector<LandmarkState> StatesWithMarginals(bool confirmed_only) const;
   void StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3d& T_map_lidar);
 
   MapperConfig config;
@@ -168,6 +173,24 @@ class Mapper::Impl {
   std::optional<Eigen::Isometry3d> start_pose;
 
   std::map<int, Matrix5d> marginals;  // of the landmarks' lines, as last computed
+
+  // Key frames of long ago.
+  using Cell = std::array<int, 3>;
+  Cell CellOf(const Eigen::Vector3d& position) const;
+  std::map<Cell, int> kept_in_cell;
+  std::vector<std::int64_t> key_frame_scans;    // scan number of each key frame
+  std::vector<std::size_t> key_frame_entries;   // first entry of `trajectory` of each key frame
+  int last_kept = 0;                            // before `next_judged`
+  int next_judged = 1;                          // older ones are kept or gone for good
+  int num_gone = 0;
+
+  // Changes of the graph that go into its next update together.
+  struct {
+    FactorList factors;
+    Values values;
+    UpdateOptions options;
+    std::set<Key> keys;
+  } waiting;
 
   // Landmarks near the key frame, in its frame, with their covariance relative to it.
   std::vector<Landmark> nearby;
@@ -211,8 +234,13 @@ class Mapper::Impl {
                               int id,
                               const FittedCylinder& fit,
                               const Eigen::Isometry3d& T_map_lidar) const;
+  std::optional<UncertainMotion> MotionBetween(const std::vector<FactorId>& factors,
+                                               Key from,
+                                               Key to) const;
+  int FindRedundantKeyFrame();
   void MaintainMap();
   void MoveFactors(const std::vector<FactorId>& factors, Key to, const Cylinder* initial);
+  void UpdateWaiting();
   void RefreshLines();
   void RefreshNearby(int id);
 };
@@ -480,9 +508,31 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     }
   }
 
+  // Old observations that were moved from one landmark to another hang on poses that may go now.
+  if (!waiting.factors.empty()) UpdateWaiting();
+  UpdateOptions options = waiting.options;
+  const int redundant = FindRedundantKeyFrame();
+  Eigen::Isometry3d T_kept_redundant = Eigen::Isometry3d::Identity();
+  if (redundant >= 0) {
+    const Key kept = PoseKey(last_kept), gone = PoseKey(redundant), next = PoseKey(redundant + 1);
+    const std::vector<FactorId> old = solver.FactorsOf(gone);
+    const UncertainMotion motion =
+        Compose(*MotionBetween(old, kept, gone), *MotionBetween(old, gone, next));
+    factors.push_back(std::make_shared<BetweenFactor>(
+        kept,
+        next,
+        motion.T,
+        NoiseModel::Covariance(motion.covariance).WithKernel(RobustKernel::Huber(3.0))));
+    T_kept_redundant = solver.Estimate<Eigen::Isometry3d>(kept).inverse() *
+                       solver.Estimate<Eigen::Isometry3d>(gone);
+    std::vector<FactorId>& removed = options.remove_factors;
+    removed.insert(removed.end(), old.begin(), old.end());
+    std::sort(removed.begin(), removed.end());
+    removed.erase(std::unique(removed.begin(), removed.end()), removed.end());
+  }
   UpdateResult update;
   try {
-    update = solver.Update(factors, values);
+    update = solver.Update(factors, values, options);
   } catch (const GraphError& error) {
     // The graph is as before: go on from the old key frame.
     for (int id : started) map.Remove(id);
@@ -497,7 +547,21 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
   result->variables_relinearized = update.variables_relinearized;
   result->variables_reeliminated = update.variables_reeliminated;
 
+  waiting = {};
+  if (redundant >= 0) {
+    // What hung on it hangs on the one before.
+    for (std::size_t i = key_frame_entries[static_cast<std::size_t>(redundant)];
+         i < key_frame_entries[static_cast<std::size_t>(redundant) + 1];
+         ++i) {
+      trajectory[i].key_frame = last_kept;
+      trajectory[i].T_kf_lidar = NormalizedSe3(T_kept_redundant * trajectory[i].T_kf_lidar);
+    }
+    ++next_judged;
+    ++num_gone;
+  }
   ++num_key_frames;
+  key_frame_scans.push_back(scan_number);
+  key_frame_entries.push_back(trajectory.size());
   key_frame_stamp_ns = input.stamp_ns;
   T_map_kf = solver.Estimate<Eigen::Isometry3d>(PoseKey(index));
   since_kf = UncertainMotion{};
@@ -508,18 +572,99 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
   RefreshLines();
 }
 
+Mapper::Impl::Cell Mapper::Impl::CellOf(const Eigen::Vector3d& position) const {
+  Cell cell;
+  for (int i = 0; i < 3; ++i) {
+    cell[static_cast<std::size_t>(i)] =
+        static_cast<int>(std::floor(position[i] / config.key_frame_cell_m));
+  }
+  return cell;
+}
+
+// What the between-factors say together, without those that the estimate contradicts.
+std::optional<UncertainMotion> Mapper::Impl::MotionBetween(const std::vector<FactorId>& factors,
+                                                           Key from,
+                                                           Key to) const {
+  constexpr double kOutlierError = 0.5 * 25.0;  // 1/2 chi2 of six coordinates.
+  std::optional<UncertainMotion> out;
+  double best = 0.0;
+  for (FactorId id : factors) {
+    const auto* between = dynamic_cast<const BetweenFactor*>(solver.GetFactor(id).get());
+    if (between == nullptr || between->keys()[0] != from || between->keys()[1] != to) continue;
+    const Eigen::MatrixXd W = between->noise().sqrt_information();
+    UncertainMotion motion;
+    motion.T = between->T_from_to();
+    motion.covariance = (W.transpose() * W).inverse();
+    const double error = solver.FactorError(id);
+    if (!out || (best > kOutlierError && error < best)) {
+      out = motion;
+      best = error;
+    } else if (error <= kOutlierError) {
+      out = Fuse(*out, motion);
+    }
+  }
+  return out;
+}
+
+// The next key frame that is old and stands where there are enough others, or -1. Its observations
+// are given up: what is left knows less than all of them did, never more.
+int Mapper::Impl::FindRedundantKeyFrame() {
+  constexpr int kMinOthers = 4;  // Observations that a landmark must keep.
+  constexpr int kLater = 5;      // Key frames.
+  if (config.key_frames_per_cell == 0) return -1;
+  for (; next_judged < num_key_frames - config.key_frame_window; ++next_judged) {
+    // Candidates that only it saw must have had their time, and be out of the graph.
+    const int later = std::min(next_judged + kLater, num_key_frames - 1);
+    if (scan_number - key_frame_scans[static_cast<std::size_t>(later)] <=
+        config.tree_map.candidate_max_gap_scans) {
+      return -1;
+    }
+    const Key key = PoseKey(next_judged);
+    int& kept = kept_in_cell[CellOf(solver.Estimate<Eigen::Isometry3d>(key).translation())];
+    bool redundant = kept >= config.key_frames_per_cell;
+    if (redundant) {
+      const std::vector<FactorId> factors = solver.FactorsOf(key);
+      for (FactorId id : factors) {
+        const auto* o = dynamic_cast<const CylinderFactor*>(solver.GetFactor(id).get());
+        if (o != nullptr && solver.NumFactorsOf(o->keys()[1]) <= kMinOthers) redundant = false;
+      }
+      redundant = redundant && MotionBetween(factors, PoseKey(last_kept), key) &&
+                  MotionBetween(factors, key, PoseKey(next_judged + 1));
+    }
+    if (redundant) return next_judged;
+    ++kept;
+    last_kept = next_judged;
+  }
+  return -1;
+}
+
+void Mapper::Impl::UpdateWaiting() {
+  if (!waiting.factors.empty() || !waiting.options.remove_factors.empty()) {
+    solver.Update(waiting.factors, waiting.values, waiting.options);
+  }
+  waiting = {};
+}
+
 // Confirms, drops, merges and splits, and keeps the graph in step.
 void Mapper::Impl::MaintainMap() {
   for (int id : map.Promote(scan_number)) {
     const std::vector<FactorId> factors = solver.FactorsOf(LandmarkKey(id));
-    solver.RemoveFactors(factors);
+    waiting.options.remove_factors.insert(
+        waiting.options.remove_factors.end(), factors.begin(), factors.end());
     map.Remove(id);
     marginals.erase(id);
   }
+  const auto wait_for = [this](Key a, Key b) {
+    const bool known = waiting.keys.count(a) + waiting.keys.count(b) > 0;
+    if (known) UpdateWaiting();
+    waiting.keys.insert(a);
+    waiting.keys.insert(b);
+  };
   // A few per key frame: the rest waits for the next one.
   for (int i = 0; i < 3; ++i) {
     const std::optional<LandmarkMerge> merge = map.FindDuplicate(config.association);
     if (!merge) break;
+    wait_for(LandmarkKey(merge->keep_id), LandmarkKey(merge->drop_id));
     MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)), LandmarkKey(merge->keep_id), nullptr);
     map.Merge(*merge);
     marginals.erase(merge->drop_id);
@@ -527,6 +672,7 @@ void Mapper::Impl::MaintainMap() {
   for (int i = 0; i < 3; ++i) {
     const std::optional<LandmarkSplit> split = map.FindSplit();
     if (!split) break;
+    wait_for(LandmarkKey(split->landmark_id), LandmarkKey(split->landmark_id));
     const Cylinder line = map.State(split->landmark_id).line;
     const Matrix5d covariance = map.State(split->landmark_id).covariance;
     const double middle = 0.5 * (split->gap_begin_m + split->gap_end_m);
@@ -547,36 +693,32 @@ void Mapper::Impl::MaintainMap() {
       MoveFactors(moved, LandmarkKey(piece.first), &line);
     } else {
       // Nothing of this session fell on it: what an earlier one knew holds for both pieces.
-      Values values;
-      values.Insert(LandmarkKey(piece.first), Value(line));
-      solver.Update({std::make_shared<CylinderPrior>(
-                        LandmarkKey(piece.first), line, NoiseModel::Covariance(covariance))},
-                    values);
+      waiting.values.Insert(LandmarkKey(piece.first), Value(line));
+      waiting.factors.push_back(std::make_shared<CylinderPrior>(
+          LandmarkKey(piece.first), line, NoiseModel::Covariance(covariance)));
     }
+    UpdateWaiting();
     if (!solver.Contains(LandmarkKey(piece.first))) map.Remove(piece.first);
     if (!solver.Contains(LandmarkKey(split->landmark_id))) map.Remove(split->landmark_id);
   }
+  // The rest goes with the next key frame.
 }
 
-// Hangs observations of one landmark on another one, which `initial` creates.
+// Hangs observations of one landmark on another one, which `initial` creates, with the next update.
 void Mapper::Impl::MoveFactors(const std::vector<FactorId>& factors,
                                Key to,
                                const Cylinder* initial) {
-  FactorList moved;
-  UpdateOptions options;
   for (FactorId id : factors) {
     const FactorPtr& factor = solver.GetFactor(id);
     if (const auto* o = dynamic_cast<const CylinderFactor*>(factor.get())) {
-      moved.push_back(std::make_shared<CylinderFactor>(
+      waiting.factors.push_back(std::make_shared<CylinderFactor>(
           o->keys()[0], to, o->measured(), o->covariance(), o->parts(), o->noise().kernel()));
     } else if (const auto* prior = dynamic_cast<const CylinderPrior*>(factor.get())) {
-      moved.push_back(std::make_shared<CylinderPrior>(to, prior->mean(), prior->noise()));
+      waiting.factors.push_back(std::make_shared<CylinderPrior>(to, prior->mean(), prior->noise()));
     }
-    options.remove_factors.push_back(id);
+    waiting.options.remove_factors.push_back(id);
   }
-  Values values;
-  if (initial != nullptr) values.Insert(to, Value(*initial));
-  solver.Update(moved, values, options);
+  if (initial != nullptr) waiting.values.Insert(to, Value(*initial));
 }
 
 // Brings the landmarks' lines up to date with the graph, and the covariances of those in reach of
@@ -602,17 +744,18 @@ void Mapper::Impl::RefreshLines() {
     by_distance.resize(static_cast<std::size_t>(config.nearby_max));
   }
   std::vector<int> ids;
-  std::vector<Key> keys{pose};
   for (const auto& [distance, id] : by_distance) ids.push_back(id);
   std::sort(ids.begin(), ids.end());
+  std::vector<Key> keys;
   for (int id : ids) keys.push_back(LandmarkKey(id));
-  const Eigen::MatrixXd joint = solver.JointMarginalCovariance(keys);
-  kf_covariance = joint.topLeftCorner<6, 6>();
+  const std::vector<Eigen::MatrixXd> joints = solver.PairMarginalCovariances(pose, keys);
+  kf_covariance = joints.empty() ? Matrix6d(solver.MarginalCovariance(pose))
+                                 : Matrix6d(joints.front().topLeftCorner<6, 6>());
   nearby.clear();
   for (std::size_t i = 0; i < ids.size(); ++i) {
     const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(ids[i]));
-    const Eigen::Index at = 6 + 5 * static_cast<Eigen::Index>(i);
-    marginals[ids[i]] = joint.block<5, 5>(at, at);
+    const Eigen::MatrixXd& joint = joints[i];
+    marginals[ids[i]] = joint.bottomRightCorner<5, 5>();
     // Covariance of the landmark as the key frame sees it: what both drifted together cancels.
     const Cylinder seen = TransformCylinder(T_map_kf.inverse(), line);
     Eigen::Matrix<double, 5, 6> J_pose;
@@ -620,12 +763,7 @@ void Mapper::Impl::RefreshLines() {
     CylinderObservationResidual(seen, T_map_kf, line, &J_pose, &J_landmark);
     Eigen::Matrix<double, 5, 11> J;
     J << J_pose, J_landmark;
-    Eigen::Matrix<double, 11, 11> C;
-    C.topLeftCorner<6, 6>() = joint.topLeftCorner<6, 6>();
-    C.topRightCorner<6, 5>() = joint.block<6, 5>(0, at);
-    C.bottomLeftCorner<5, 6>() = joint.block<5, 6>(at, 0);
-    C.bottomRightCorner<5, 5>() = joint.block<5, 5>(at, at);
-    const Matrix5d relative = J * C * J.transpose();
+    const Matrix5d relative = J * joint * J.transpose();
     const Matrix5d R = CylinderTangentTransform(T_map_kf, seen);
     map.SetLine(ids[i], line, R * relative * R.transpose());
     nearby.emplace_back();
@@ -895,11 +1033,13 @@ std::vector<StampedPose> Mapper::Impl::Trajectory() const {
   return out;
 }
 
-std::vector<LandmarkState> Mapper::Impl::StatesWithMarginals() const {
-  std::vector<LandmarkState> states = map.states();
-  for (LandmarkState& state : states) {
+std::vector<LandmarkState> Mapper::Impl::StatesWithMarginals(bool confirmed_only) const {
+  std::vector<LandmarkState> states;
+  for (const LandmarkState& state : map.states()) {
+    if (confirmed_only && !state.confirmed) continue;
+    states.push_back(state);
     const auto it = marginals.find(state.id);
-    if (it != marginals.end()) state.covariance = it->second;
+    if (it != marginals.end()) states.back().covariance = it->second;
   }
   return states;
 }
@@ -921,7 +1061,7 @@ std::vector<Landmark> Mapper::Landmarks() const {
   if (impl_->pending) {
     map.Restore(impl_->pending->landmarks, impl_->pending->next_landmark_id);
   } else {
-    map.Restore(impl_->StatesWithMarginals(), impl_->map.next_id());
+    map.Restore(impl_->StatesWithMarginals(true), impl_->map.next_id());
   }
   return SeparatePieces(map.Landmarks(false));
 }
@@ -931,7 +1071,7 @@ std::vector<Landmark> Mapper::AllLandmarks() const {
   if (impl_->pending) {
     map.Restore(impl_->pending->landmarks, impl_->pending->next_landmark_id);
   } else {
-    map.Restore(impl_->StatesWithMarginals(), impl_->map.next_id());
+    map.Restore(impl_->StatesWithMarginals(false), impl_->map.next_id());
   }
   return map.Landmarks(true);
 }
@@ -945,11 +1085,15 @@ Eigen::Isometry3d Mapper::T_map_odom() const {
 int Mapper::num_key_frames() const {
   return impl_->pending ? impl_->local->num_key_frames() : impl_->num_key_frames;
 }
+int Mapper::num_kept_key_frames() const {
+  return impl_->pending ? impl_->local->num_kept_key_frames()
+                        : impl_->num_key_frames - impl_->num_gone;
+}
 bool Mapper::relocalizing() const { return impl_->pending.has_value(); }
 
 MapSnapshot Mapper::Snapshot() const {
   if (impl_->pending) return *impl_->pending;
-  return {impl_->map.next_id(), impl_->upright, impl_->StatesWithMarginals()};
+  return {impl_->map.next_id(), impl_->upright, impl_->StatesWithMarginals(false)};
 }
 
 void Mapper::Load(const MapSnapshot& snapshot) {

@@ -297,6 +297,7 @@ void TreeMap::Observe(int id,
                       std::int64_t scan_number) {
   LandmarkState* state = Find(id);
   if (state == nullptr) return;
+  summaries_.erase(id);
   const Cylinder in_map = TransformCylinder(T_map_lidar, observation.cylinder);
   const double sign = in_map.axis.dot(state->line.axis) < 0.0 ? -1.0 : 1.0;
   const double s = (in_map.point - state->line.point).dot(state->line.axis);
@@ -342,8 +343,12 @@ void TreeMap::Observe(int id,
 void TreeMap::SetLine(int id, const Cylinder& line, const Matrix5d& covariance) {
   LandmarkState* state = Find(id);
   if (state == nullptr) return;
+  const bool same = state->line.point == line.point && state->line.axis == line.axis &&
+                    state->line.curvature == line.curvature && state->covariance == covariance;
+  if (same) return;
   state->line = line;
   state->covariance = covariance;
+  summaries_.erase(id);
 }
 
 std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
@@ -363,11 +368,13 @@ std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
     }
     if (best > config_.confirm_radius_sigma_rel) continue;
     state.confirmed = true;
+    summaries_.erase(state.id);
   }
   return drop;
 }
 
 void TreeMap::Remove(int id) {
+  summaries_.erase(id);
   states_.erase(std::remove_if(states_.begin(),
                                states_.end(),
                                [id](const LandmarkState& state) { return state.id == id; }),
@@ -376,23 +383,34 @@ void TreeMap::Remove(int id) {
 
 std::optional<LandmarkMerge> TreeMap::FindDuplicate(
     const DataAssociationConfig& association) const {
-  std::vector<Landmark> summaries;
-  summaries.reserve(states_.size());
+  std::vector<const Landmark*> summaries;
+  std::vector<double> thickest;
   for (const LandmarkState& state : states_) {
-    summaries.push_back(Summarize(state, config_, profile_config_));
+    summaries.push_back(&SummaryOf(state));
+    double radius = summaries.back()->cylinder.radius();
+    for (const RadiusKnot& knot : summaries.back()->profile) radius = std::max(radius, knot.radius_m);
+    thickest.push_back(radius);
   }
+  constexpr double kMaxSlope = 0.25;       // Sine of the largest angle, rounded up.
+  constexpr double kMaxOffsetRadii = 1.5;  // Offsets are measured across either axis.
+  constexpr double kMaxBendM = 0.2;        // Of an axis beside its straight line.
   DataAssociationConfig gates = association;
   gates.gate_sigma = config_.merge_gate_sigma;
   for (std::size_t i = 0; i < summaries.size(); ++i) {
-    const Landmark& a = summaries[i];
+    const Landmark& a = *summaries[i];
     for (std::size_t j = i + 1; j < summaries.size(); ++j) {
-      const Landmark& b = summaries[j];
+      const Landmark& b = *summaries[j];
       if (!a.confirmed && !b.confirmed) continue;
       if (std::abs(a.cylinder.axis.dot(b.cylinder.axis)) < 0.97) continue;
-      if (std::abs((b.cylinder.point - a.cylinder.point).dot(a.cylinder.axis)) >
-          config_.merge_reach_m) {
-        continue;
-      }
+      const Eigen::Vector3d apart = b.cylinder.point - a.cylinder.point;
+      const double along = apart.dot(a.cylinder.axis);
+      if (std::abs(along) > config_.merge_reach_m) continue;
+      // A bound on the offset that is looked at below, wherever along b it is taken.
+      const double reach = kMaxSlope * std::max(std::abs(b.s_min_m), std::abs(b.s_max_m)) +
+                           kMaxOffsetRadii * std::max(0.5, config_.merge_inside_radii) *
+                               std::max(thickest[i], thickest[j]) +
+                           association.offset_sigma_floor_m + kMaxBendM;
+      if (apart.squaredNorm() - along * along > reach * reach) continue;
       FittedCylinder as_observation;
       as_observation.status = FitStatus::kMeasured;
       as_observation.cylinder = b.cylinder;
@@ -435,6 +453,7 @@ void TreeMap::Merge(const LandmarkMerge& merge) {
   LandmarkState* keep = Find(merge.keep_id);
   const LandmarkState* drop = Find(merge.drop_id);
   if (keep == nullptr || drop == nullptr || keep == drop) return;
+  summaries_.erase(merge.keep_id);
   const bool same_sign = keep->line.axis.dot(drop->line.axis) >= 0.0;
   const double offset = (drop->line.point - keep->line.point).dot(keep->line.axis);
   // Where the other's zero of the angle lies in this basis.
@@ -509,6 +528,7 @@ std::pair<int, bool> TreeMap::Split(const LandmarkSplit& split) {
   if (state == nullptr) {
     throw std::invalid_argument("TreeMap: no landmark with id " + std::to_string(split.landmark_id));
   }
+  summaries_.erase(split.landmark_id);
   const double cell = config_.coverage_cell_m;
   const double middle = 0.5 * (split.gap_begin_m + split.gap_end_m);
   LandmarkState below = *state, above = *state;
@@ -541,18 +561,25 @@ std::pair<int, bool> TreeMap::Split(const LandmarkSplit& split) {
   return {fresh_id, new_is_above};
 }
 
-Landmark TreeMap::Summary(int id) const { return Summarize(State(id), config_, profile_config_); }
+const Landmark& TreeMap::SummaryOf(const LandmarkState& state) const {
+  const auto it = summaries_.find(state.id);
+  if (it != summaries_.end()) return it->second;
+  return summaries_.emplace(state.id, Summarize(state, config_, profile_config_)).first->second;
+}
+
+Landmark TreeMap::Summary(int id) const { return SummaryOf(State(id)); }
 
 std::vector<Landmark> TreeMap::Landmarks(bool with_candidates) const {
   std::vector<Landmark> out;
   for (const LandmarkState& state : states_) {
-    if (state.confirmed || with_candidates) out.push_back(Summarize(state, config_, profile_config_));
+    if (state.confirmed || with_candidates) out.push_back(SummaryOf(state));
   }
   return out;
 }
 
 void TreeMap::Restore(std::vector<LandmarkState> states, int next_id) {
   states_ = std::move(states);
+  summaries_.clear();
   next_id_ = next_id;
 }
 

@@ -224,6 +224,29 @@ TEST(Mapper, ASecondSessionFindsItselfAndKeepsTheIds) {
             0.1);
 }
 
+TEST(Mapper, ManyLapsLeaveAGraphOfOne) {
+  World world(ThesisLikeTree(), 15);
+  MapperConfig config;
+  config.key_frames_per_cell = 2;
+  config.key_frame_window = 20;
+  Mapper mapper(config);
+  FlightOptions options;
+  options.scans = 2000;  // Eight laps.
+  options.climb = 0.0;
+  options.z0 = 1.5;
+  const FlightResult flight = Fly(&mapper, &world, options);
+  EXPECT_LT(TrajectoryAte(flight, mapper), 0.02);
+  const MapScore score =
+      Score(mapper.Landmarks(), world.branches(), TruthFromMap(flight, mapper));
+  EXPECT_GE(score.branches_found, 3);  // Of four: one is out of sight of a level path.
+  EXPECT_EQ(score.false_count, 0);
+  EXPECT_LT(Median(score.radius_error_rel), 0.01);
+  ASSERT_EQ(mapper.Trajectory().size(), flight.truth.size());
+  EXPECT_GT(mapper.num_key_frames(), 400);
+  // A lap goes through about 40 cubes; the newest key frames stay as long as candidates do, 30 s.
+  EXPECT_LT(mapper.num_kept_key_frames(), 200);
+}
+
 TEST(Mapper, SameInputSameBytes) {
   std::vector<Landmark> maps[2];
   for (auto& map : maps) {

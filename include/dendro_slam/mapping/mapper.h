@@ -19,6 +19,12 @@ struct MapperConfig {
   double key_frame_angle_deg = 10.0;    ///< Turned since the last one [deg]. > 0.
   double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
 
+  // An hour of walking the same rows must not make the graph grow: where many key frames stand already,
+  // a later one is taken out again once it is old.
+  double key_frame_cell_m = 1.0;        ///< Side of the cubes in which key frames are counted [m]. > 0.
+  int key_frames_per_cell = 6;          ///< Old key frames kept in a cube; 0: all of them. >= 0.
+  int key_frame_window = 100;           ///< The newest ones are always kept. >= 1.
+
   // Odometry. The messages' own covariances do not tell the drift.
   double vio_walk_m_per_sqrt_m = 0.02;    ///< Random walk per axis per root metre travelled, slow drift
                                           ///< included. >= 0.
@@ -75,6 +81,9 @@ struct MapperConfig {
     v("key_frame_distance_m", key_frame_distance_m);
     v("key_frame_angle_deg", key_frame_angle_deg);
     v("key_frame_time_s", key_frame_time_s);
+    v("key_frame_cell_m", key_frame_cell_m);
+    v("key_frames_per_cell", key_frames_per_cell);
+    v("key_frame_window", key_frame_window);
     v("vio_walk_m_per_sqrt_m", vio_walk_m_per_sqrt_m);
     v("vio_walk_rad_per_sqrt_m", vio_walk_rad_per_sqrt_m);
     v("vio_tilt_walk_rad_per_sqrt_m", vio_tilt_walk_rad_per_sqrt_m);
@@ -152,6 +161,8 @@ class Mapper {
   /// Correction of the odometry at the last scan that had odometry; identity before.
   Eigen::Isometry3d T_map_odom() const;
   int num_key_frames() const;
+  /// Of those, how many are still in the graph.
+  int num_kept_key_frames() const;
   /// A loaded map has not been found again yet: results are in a frame of their own.
   bool relocalizing() const;
 

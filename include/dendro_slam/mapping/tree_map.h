@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <optional>
+#include <unordered_map>
 #include <vector>
 
 #include "dendro_slam/mapping/data_association.h"
@@ -149,6 +150,7 @@ class TreeMap {
   const TreeMapConfig& config() const { return config_; }
 
  private:
+  const Landmark& SummaryOf(const LandmarkState& state) const;
   LandmarkState* Find(int id);
   const LandmarkState* Find(int id) const;
 
@@ -156,6 +158,7 @@ class TreeMap {
   RadiusProfileConfig profile_config_;
   std::vector<LandmarkState> states_;
   int next_id_ = 0;
+  mutable std::unordered_map<int, Landmark> summaries_;  // By id, of landmarks that did not change since.
 };
 
 }  // namespace dendro
