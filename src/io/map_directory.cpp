@@ -931,10 +931,37 @@ std::string TimingJson(const StageTimer& timer) {
   return j.dump(2) + "\n";
 }
 
+// CRC-32 (ISO 3309) over a map file with its checksum left blank. A flipped bit may leave a number that
+// looks like any other: nothing else would tell.
+constexpr std::string_view kNoChecksum = "--------";
+constexpr std::string_view kChecksumField = "\"checksum\": \"";
+
+// Where the checksum stands in a map file, or npos.
+std::size_t ChecksumPlace(const std::string& text) {
+  const std::size_t field = text.find(kChecksumField);
+  const std::size_t at = field + kChecksumField.size();
+  if (field == std::string::npos || at + kNoChecksum.size() > text.size()) return std::string::npos;
+  return at;
+}
+
+std::string WithChecksum(std::string text) {
+  const std::size_t at = ChecksumPlace(text);
+  if (at == std::string::npos) return text;
+  text.replace(at, kNoChecksum.size(), kNoChecksum);
+  std::uint32_t crc = 0xffffffffU;
+  for (const char c : text) {
+    crc ^= static_cast<unsigned char>(c);
+    for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1U) ^ ((crc & 1U) != 0U ? 0xedb88320U : 0U);
+  }
+  text.replace(at, kNoChecksum.size(), fmt::format("{:08x}", ~crc));
+  return text;
+}
+
 std::string TreeMapJson(const MapFiles& files) {
   Json j;
   j["format"] = kFormatName;
   j["version"] = kFormatVersion;
+  j["checksum"] = std::string(kNoChecksum);
   j["frame"] = files.frame;
   j["stamp_ns"] = files.model.stamp_ns;
   j["next_landmark_id"] = files.next_landmark_id;
@@ -984,7 +1011,7 @@ void SaveMap(const std::string& directory, const MapFiles& files, const StageTim
   contents.emplace_back("tree.ply", MeshToPly(ModelMesh(files.model, MeshColor::kByBranch)));
   if (!files.points.empty()) contents.emplace_back(kPointsFile, PointsToPly(files.points));
   if (timer != nullptr) contents.emplace_back("timing.json", TimingJson(*timer));
-  contents.emplace_back("tree_map.json", TreeMapJson(files));
+  contents.emplace_back("tree_map.json", WithChecksum(TreeMapJson(files)));
 
   MakeDirectory(directory);
   const std::filesystem::path root(directory);
@@ -1011,8 +1038,9 @@ MapFiles LoadMap(const std::string& directory) {
   const std::filesystem::path root(directory);
   const std::string file = (root / "tree_map.json").string();
   Json json;
+  const std::string text = ReadFile(file);
   try {
-    json = Json::parse(ReadFile(file));
+    json = Json::parse(text);
   } catch (const Json::exception& error) {
     throw MapFileError(fmt::format("{}: the file is not JSON: {}", file, error.what()));
   }
@@ -1056,6 +1084,12 @@ MapFiles LoadMap(const std::string& directory) {
   files.snapshot.upright = j["upright"].Bool();
   files.snapshot.next_landmark_id = j["next_landmark_state_id"].NonNegative();
   read_list("landmark_states", ReadLandmarkState, &files.snapshot.landmarks);
+  // Last, so that a field that is wrong is named; absent from maps of before.
+  if (json.contains("checksum") && WithChecksum(text) != text) {
+    j["checksum"].Fail(
+        "does not fit what the file says: it was damaged, take a copy of the map (or changed by hand: then "
+        "take out the line \"checksum\")");
+  }
 
   const std::filesystem::path trajectory = root / "trajectory.tum";
   if (std::filesystem::exists(trajectory)) files.trajectory = ReadTrajectory(trajectory.string());

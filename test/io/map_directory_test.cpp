@@ -442,6 +442,26 @@ TEST_F(Directory, RandomDamageNeverCrashes) {
   }
 }
 
+TEST_F(Directory, EveryFlippedBitIsFound) {
+  SaveMap(map_, SomeMap());
+  const std::string good = Read("tree_map.json");
+  std::uint64_t state = 777;
+  for (int i = 0; i < 300; ++i) {
+    std::string text = good;
+    state = state * 6364136223846793005ULL + 1442695040888963407ULL;
+    text[(state >> 20) % text.size()] ^= static_cast<char>(1 << ((state >> 50) % 7));
+    if (text.find("\"checksum\"") == std::string::npos) continue;  // Now one of before.
+    Write("tree_map.json", text);
+    EXPECT_THROW(LoadMap(map_), MapFileError) << i;
+  }
+  // Changed by hand, and maps of before: no checksum, no complaint.
+  std::string text = good;
+  const std::size_t line = text.rfind('\n', text.find("\"checksum\""));
+  text.erase(line, text.find('\n', line + 1) - line);
+  Write("tree_map.json", text);
+  EXPECT_NO_THROW(LoadMap(map_));
+}
+
 TEST_F(Directory, ScansAreStreamed) {
   LabelledScan scan;
   RangeImage& image = scan.image;
