@@ -20,6 +20,12 @@ void StageTimer::Add(const std::string& stage, double duration_ms) {
   durations_ms_[stage].push_back(duration_ms);
 }
 
+const std::vector<double>& StageTimer::Durations(const std::string& stage) const {
+  static const std::vector<double> none;
+  const auto it = durations_ms_.find(stage);
+  return it == durations_ms_.end() ? none : it->second;
+}
+
 std::map<std::string, StageTimer::Summary> StageTimer::Summaries() const {
   std::map<std::string, Summary> summaries;
   for (const auto& [stage, durations] : durations_ms_) {

@@ -38,7 +38,8 @@ std::vector<BranchHits> CountBranchHits(const SimulatedScan& scan) {
   return out;
 }
 
-TruthWriter::TruthWriter(const std::string& folder, const Scene& scene) : folder_(folder) {
+TruthWriter::TruthWriter(const std::string& folder, const Scene& scene, bool with_labels)
+    : folder_(folder), with_labels_(with_labels) {
   std::error_code error;
   std::filesystem::create_directories(folder, error);
   if (error) throw SceneFileError(fmt::format("{}: cannot be created: {}", folder, error.message()));
@@ -51,29 +52,33 @@ TruthWriter::TruthWriter(const std::string& folder, const Scene& scene) : folder
   };
   open(&trajectory_, "trajectory.tum", std::ios::out);
   open(&hits_, "hits.csv", std::ios::out);
-  open(&labels_, "labels.bin", std::ios::out | std::ios::binary);
   hits_ << "stamp,tree,branch,hits\n";
+  if (!with_labels_) return;
+  open(&labels_, "labels.bin", std::ios::out | std::ios::binary);
   labels_.write("DSTRUTH1", 8);
 }
 
 TruthWriter::~TruthWriter() = default;
 
-void TruthWriter::AddScan(const SimulatedScan& scan) {
+void TruthWriter::AddScan(const SimulatedScan& scan, bool with_hits) {
   const std::string stamp = StampText(scan.scan.stamp_ns);
   const Eigen::Vector3d t = scan.T_map_lidar.translation();
   Eigen::Quaterniond q(scan.T_map_lidar.linear());
   if (q.w() < 0.0) q.coeffs() = -q.coeffs();
   trajectory_ << fmt::format("{} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n", stamp, t.x(), t.y(),
                              t.z(), q.x(), q.y(), q.z(), q.w());
+  if (with_hits) {
+    for (const BranchHits& row : CountBranchHits(scan)) {
+      hits_ << fmt::format("{},{},{},{}\n", stamp, row.tree_id, row.branch_id, row.hits);
+    }
+  }
+  if (!with_labels_) return;
   std::vector<std::uint8_t> label;
   std::vector<std::int16_t> branch, tree;
   for (const PointTruth& truth : scan.truth) {
     label.push_back(static_cast<std::uint8_t>(SurfaceLabel(truth.kind)));
     branch.push_back(truth.branch_id);
     tree.push_back(truth.tree_id);
-  }
-  for (const BranchHits& row : CountBranchHits(scan)) {
-    hits_ << fmt::format("{},{},{},{}\n", stamp, row.tree_id, row.branch_id, row.hits);
   }
   Write(&labels_, scan.scan.stamp_ns);
   Write(&labels_, static_cast<std::uint32_t>(label.size()));
@@ -85,6 +90,7 @@ void TruthWriter::AddScan(const SimulatedScan& scan) {
 void TruthWriter::Finish() {
   for (auto [file, name] : {std::pair(&trajectory_, "trajectory.tum"), std::pair(&hits_, "hits.csv"),
                             std::pair(&labels_, "labels.bin")}) {
+    if (file == &labels_ && !with_labels_) continue;
     file->close();
     if (!*file) throw SceneFileError(fmt::format("{}/{}: could not be written", folder_, name));
   }

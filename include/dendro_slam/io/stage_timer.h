@@ -21,6 +21,9 @@ class StageTimer {
   /// @param duration_ms  Time spent [ms], >= 0.
   void Add(const std::string& stage, double duration_ms);
 
+  /// Durations of a stage so far [ms], in the order they came; empty for a stage that is not known.
+  const std::vector<double>& Durations(const std::string& stage) const;
+
   /// Seconds of data that the durations belong to, for the real-time factor.
   void set_data_duration_s(double seconds) { data_duration_s_ = seconds; }
   double data_duration_s() const { return data_duration_s_; }

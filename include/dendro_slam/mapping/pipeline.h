@@ -206,6 +206,7 @@ class Pipeline {
 
   /// Durations of the stages so far.
   StageTimer& timer() { return timer_; }
+  const StageTimer& timer() const { return timer_; }
 
  private:
   PipelineConfig config_;

@@ -24,17 +24,20 @@ namespace dendro {
 class TruthWriter {
  public:
   /// Creates the folder if needed.
+  /// @param with_labels  False for long flights: no labels.bin (0.5 GB per hour and 1000 returns).
   /// @throws SceneFileError  If a file cannot be written.
-  TruthWriter(const std::string& folder, const Scene& scene);
+  TruthWriter(const std::string& folder, const Scene& scene, bool with_labels = true);
   ~TruthWriter();
 
-  void AddScan(const SimulatedScan& scan);
+  /// @param with_hits  False: no rows in hits.csv.
+  void AddScan(const SimulatedScan& scan, bool with_hits = true);
 
   /// Closes the files. @throws SceneFileError  If something could not be written.
   void Finish();
 
  private:
   std::string folder_;
+  bool with_labels_;
   std::ofstream trajectory_;
   std::ofstream hits_;
   std::ofstream labels_;
