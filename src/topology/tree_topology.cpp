@@ -267,8 +267,10 @@ bool GapIsBlocked(const std::vector<Piece>& pieces, const Joint& joint) {
 // True when two pieces of equal thickness meet at these ends like the halves of an elbow: their axes
 // pass each other closely, and neither runs on beyond the other by more than its fit may overshoot.
 bool IsElbow(const Piece& a, int e, const Piece& b, int f, const TopologyConfig& config) {
-  const double radius = std::max(a.radius[e], b.radius[f]);
-  if (radius > kElbowRadiusRatio * std::min(a.radius[e], b.radius[f])) return false;
+  // Radii of the middles: in the bend itself a straight piece fits badly.
+  const double ra = RadiusAt(*a.landmark, 0.0), rb = RadiusAt(*b.landmark, 0.0);
+  const double radius = std::max(ra, rb);
+  if (radius > kElbowRadiusRatio * std::min(ra, rb)) return false;
   const ClosestPoints closest = ClosestOfSegments(a.end[e] + radius * a.Outward(e),
                                                   a.end[1 - e],
                                                   b.end[f] + radius * b.Outward(f),
@@ -317,7 +319,7 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
           }
           const double ratio = std::max(ra, rb) / std::min(ra, rb);
           const double radius_sigma = std::hypot(a.sigma[e], b.sigma[f]);
-          if (ratio > config.join_radius_ratio && std::abs(ra - rb) > 2.0 * radius_sigma) continue;
+          if (!elbow && ratio > config.join_radius_ratio && std::abs(ra - rb) > 2.0 * radius_sigma) continue;
           const double bend = std::acos(std::clamp(cosine, -1.0, 1.0));
           const double cost = std::abs(along) + 2.0 * sideways + 0.5 * bend + 0.5 * std::log(ratio);
           const Joint joint{cost, i, e, j, f};
