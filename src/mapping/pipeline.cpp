@@ -131,10 +131,8 @@ MapperResult TreeMappingStage::Process(const MapperInput& input,
   MapperInput with_ground = input;
   with_ground.ground = ground;
   MapperResult result = mapper_.AddScan(with_ground);
-  if (ground && !mapper_.relocalizing()) AddGround(*ground, result.T_map_lidar);
-  if (result.is_key_frame) {
-    model_ = topology_.Build(mapper_.Landmarks(), result.stamp_ns, GroundHeight());
-  }
+  if (ground && !mapper_.relocalizing()) ground_.Add(*ground, result.T_map_lidar);
+  if (result.is_key_frame) model_ = BuildModel(result.stamp_ns);
   return result;
 }
 
@@ -142,26 +140,10 @@ void TreeMappingStage::AddPoints(const LabelledScan& scan, const Eigen::Isometry
   if (config_.map_cloud.enabled && !mapper_.relocalizing()) cloud_.Add(scan, T_map_lidar);
 }
 
-void TreeMappingStage::AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
-  constexpr double kMinUp = 0.9;        // A steeper plane is a bank, or the map is not upright.
-  constexpr double kMaxReach_m = 10.0;  // Farther off the slope decides.
-  constexpr double kMaxHeight_m = 5.0;  // From higher up only far ground is seen.
-  if (model_.trees.size() != 1) return;
-  const Eigen::Vector3d& base = model_.trees.front().base;
-  const Eigen::Vector3d normal = T_map_lidar.linear() * ground.normal.cast<double>();
-  const Eigen::Vector3d lidar = T_map_lidar.translation();
-  if (normal.z() < kMinUp || ground.offset > kMaxHeight_m) return;
-  if ((base - lidar).head<2>().norm() > kMaxReach_m) return;
-  // Height(p) = normal . (p - lidar) + offset = 0 below the base.
-  const double sideways = normal.head<2>().dot((base - lidar).head<2>());
-  ground_z_sum_m_ += lidar.z() - (ground.offset + sideways) / normal.z();
-  ++ground_count_;
-}
-
-std::optional<double> TreeMappingStage::GroundHeight() const {
-  constexpr int kMinScans = 10;
-  if (ground_count_ < kMinScans || model_.trees.size() != 1) return std::nullopt;
-  return ground_z_sum_m_ / ground_count_;
+TreeModel TreeMappingStage::BuildModel(std::int64_t stamp_ns) {
+  return topology_.Build(mapper_.Landmarks(), stamp_ns, [this](const Eigen::Vector2d& place) {
+    return ground_.At(place);
+  });
 }
 
 MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& config) {
@@ -169,7 +151,7 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   files.trajectory = mapper_.Trajectory();
   const std::int64_t stamp_ns =
       files.trajectory.empty() ? model_.stamp_ns : files.trajectory.back().stamp_ns;
-  model_ = topology_.Build(mapper_.Landmarks(), stamp_ns, GroundHeight());
+  model_ = BuildModel(stamp_ns);
   files.points = cloud_.Points(files.trajectory);
   AssignPoints(
       model_, config_.map_cloud.wood_reach_m, config_.map_cloud.leaf_reach_m, &files.points);
@@ -197,9 +179,8 @@ void TreeMappingStage::Load(const MapFiles& files) {
   georeferencer_.Clear();
   loaded_georeference_ = files.georeference;
   cloud_.Restore(files.points);
-  ground_z_sum_m_ = 0.0;
-  ground_count_ = 0;
-  model_ = topology_.Build(mapper_.Landmarks(), files.model.stamp_ns);
+  ground_.Clear();
+  model_ = BuildModel(files.model.stamp_ns);
 }
 
 void TreeMappingStage::Reset() {
@@ -209,8 +190,7 @@ void TreeMappingStage::Reset() {
   loaded_georeference_.reset();
   cloud_.Reset();
   model_ = TreeModel();
-  ground_z_sum_m_ = 0.0;
-  ground_count_ = 0;
+  ground_.Clear();
 }
 
 Pipeline::Pipeline(const PipelineConfig& config)

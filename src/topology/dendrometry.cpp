@@ -170,7 +170,11 @@ void MeasureTrees(double breast_height_m, double min_volume_radius_m, TreeModel*
     const std::optional<StemDiameter> dbh = DiameterAtHeight(*model, tree, breast_height_m);
     if (dbh) {
       tree.dbh_m = dbh->diameter_m;
-      tree.dbh_sigma_m = dbh->sigma_m;
+      // A base that is off by its sigma measures the stem that much higher or lower.
+      const auto high = DiameterAtHeight(*model, tree, breast_height_m + tree.base_sigma_m);
+      const auto low = DiameterAtHeight(*model, tree, breast_height_m - tree.base_sigma_m);
+      const double step = high && low ? 0.5 * std::abs(high->diameter_m - low->diameter_m) : 0.0;
+      tree.dbh_sigma_m = std::hypot(dbh->sigma_m, step);
       tree.dbh_status = dbh->status;
     } else {
       tree.dbh_status = FitStatus::kUnresolved;

@@ -815,7 +815,7 @@ TreeTopology::TreeTopology(const TopologyConfig& config) : config_(config) { con
 
 TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
                               std::int64_t stamp_ns,
-                              std::optional<double> ground_z_m) {
+                              const GroundLookup& ground) {
   TreeModel model;
   model.stamp_ns = stamp_ns;
   const std::vector<Piece> pieces = MakePieces(landmarks);
@@ -858,7 +858,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         }
       }
     }
-    const double above = base.z() - (ground_z_m ? *ground_z_m : lowest);
+    const auto foot = ground ? ground(base.head<2>()) : std::nullopt;
+    const double above = base.z() - (foot ? foot->z_m : lowest);
     trunk_like[c] = steep && chains[c].mean_radius >= config_.min_trunk_radius_m &&
                     above <= config_.max_trunk_base_m;
     const double unlikely = lean / (0.5 * M_PI) + (1.0 - chains[c].mean_radius / thickest) +
@@ -1020,6 +1021,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     state_.origins = std::move(origins);
   }
   std::vector<std::vector<KeyedSection>> sections(n);
+  std::vector<std::optional<GroundHeight>> foot_of(n);
   for (const int c : sequence) {
     const Chain& chain = chains[c];
     const int num_links = static_cast<int>(chain.links.size());
@@ -1056,9 +1058,10 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
             config_.max_section_length_m,
             &sections[c]);
       }
-    } else if (is_tree[c] && ground_z_m && outward.z() < -0.5) {
+    } else if (is_tree[c] && ground && outward.z() < -0.5) {
       const auto [base, radius, sigma] = at(0, true);
-      const double down = (base.z() - *ground_z_m) / -outward.z();
+      foot_of[c] = ground(base.head<2>());
+      const double down = foot_of[c] ? (base.z() - foot_of[c]->z_m) / -outward.z() : 0.0;
       if (down > config_.min_gap_m && down <= config_.max_trunk_base_m) {
         AddInferred({first_id, -1},
                     InferredSection(base + down * outward, base, radius, radius, sigma, sigma),
@@ -1257,6 +1260,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     tree.id = tree_id[root];
     tree.trunk_branch_id = branch_id[root];
     tree.base = sections[root].front().cylinder.start;
+    tree.base_sigma_m = foot_of[root] ? foot_of[root]->sigma_m : 0.0;
     for (const int c : sequence) {
       if (root_of[c] == root) tree.branch_ids.push_back(branch_id[c]);
     }

@@ -14,6 +14,7 @@
 namespace dendro {
 namespace {
 
+using Eigen::Vector2d;
 using Eigen::Vector3d;
 using test::MakeLandmark;
 using testing::HasSubstr;
@@ -450,12 +451,43 @@ TEST(TreeTopology, SeveralTreesAndAPieceOnItsOwn) {
 TEST(TreeTopology, GroundGivesTheTreeItsFoot) {
   std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0.6}, {0, 0, 4.0}, 0.2, 0.166)};
   TreeTopology topology{TopologyConfig()};
-  const TreeModel model = topology.Build(landmarks, 0, 0.1);
+  const TreeModel model =
+      topology.Build(landmarks, 0, [](const auto&) { return GroundHeight{0.1, 0.0}; });
   ASSERT_EQ(model.trees.size(), 1u);
   EXPECT_NEAR(model.trees[0].base.z(), 0.1, 1e-9);
   EXPECT_NEAR(model.trees[0].height_m, 3.9, 1e-9);
   ASSERT_TRUE(model.trees[0].dbh_m.has_value());
   EXPECT_NEAR(*model.trees[0].dbh_m, 2.0 * (0.2 - 0.01 * (1.4 - 0.6)), 1e-6);
+}
+
+TEST(TreeTopology, TreesOnASlopeStandOnTheirOwnGround) {
+  // The ground rises by 0.3 m per metre of x; of every stem the lowest 50 cm were not seen.
+  std::vector<Landmark> landmarks;
+  for (int i = 0; i < 3; ++i) {
+    const double x = 5.0 * i, z = 0.3 * x;
+    landmarks.push_back(MakeLandmark(i, {x, 0, z + 0.5}, {x, 0, z + 4.5}, 0.2, 0.16));
+  }
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0, [](const Vector2d& place) {
+    return GroundHeight{0.3 * place.x(), 0.05};
+  });
+  ASSERT_EQ(model.trees.size(), 3u);
+  for (int i = 0; i < 3; ++i) {
+    const MapTree& tree = model.trees[static_cast<std::size_t>(i)];
+    EXPECT_NEAR(tree.base.z(), 0.3 * tree.base.x(), 1e-9);
+    EXPECT_NEAR(tree.height_m, 4.5, 1e-9);
+    ASSERT_TRUE(tree.dbh_m.has_value());
+    // Radius 0.2 - 0.01 (h - 0.5) at h = 1.3 m; 5 cm of height are 1 mm of diameter.
+    EXPECT_NEAR(*tree.dbh_m, 2.0 * (0.2 - 0.01 * 0.8), 1e-6);
+    EXPECT_NEAR(tree.dbh_sigma_m, std::hypot(2.0 * 0.002, 0.001), 1e-6);
+  }
+  // Where the ground was not seen, the base is the lowest wood.
+  TreeTopology blind{TopologyConfig()};
+  const TreeModel none = blind.Build(landmarks, 0, [](const Vector2d&) -> std::optional<GroundHeight> {
+    return std::nullopt;
+  });
+  ASSERT_EQ(none.trees.size(), 3u);
+  EXPECT_NEAR(none.trees[0].base.z(), 0.5, 1e-9);
 }
 
 TEST(TreeTopology, CandidatesAndEmptyInput) {

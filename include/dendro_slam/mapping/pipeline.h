@@ -14,6 +14,7 @@
 #include "dendro_slam/io/map_directory.h"
 #include "dendro_slam/io/stage_timer.h"
 #include "dendro_slam/mapping/georeference.h"
+#include "dendro_slam/mapping/ground_surface.h"
 #include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/odometry/wood_icp.h"
 #include "dendro_slam/range_image/projector.h"
@@ -119,9 +120,9 @@ class TreeMappingStage {
   explicit TreeMappingStage(const TreeMappingConfig& config);
 
   /// Takes one scan; at key frames the model is built anew.
-  /// @param ground  The ground in the lidar frame, where the scan shows it (FitGroundPlane). A map
-  ///                of one tree then stands on the mean of what was seen; with several trees or
-  ///                without it, the base is the lowest wood seen.
+  /// @param ground  The ground in the lidar frame, where the scan shows it (FitGroundPlane). Every tree
+  ///                then stands on what was seen around it (GroundSurface); without it, its base is
+  ///                the lowest wood seen.
   MapperResult Process(const MapperInput& input, const std::optional<GroundPlane>& ground);
 
   /// Takes the returns of a scan that Process has taken, where `map_cloud` is enabled; does nothing
@@ -149,9 +150,7 @@ class TreeMappingStage {
 
  private:
   TreeMappingConfig config_;
-  /// Height of the ground below the only tree of the map [m], if seen.
-  std::optional<double> GroundHeight() const;
-  void AddGround(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar);
+  TreeModel BuildModel(std::int64_t stamp_ns);
 
   Mapper mapper_;
   TreeTopology topology_;
@@ -159,8 +158,7 @@ class TreeMappingStage {
   TreeModel model_;
   Georeferencer georeferencer_;
   std::optional<Georeference> loaded_georeference_;
-  double ground_z_sum_m_ = 0.0;
-  int ground_count_ = 0;
+  GroundSurface ground_;
 };
 
 /// Result of one scan through all stages.

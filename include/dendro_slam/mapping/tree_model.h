@@ -73,6 +73,7 @@ struct MapTree {
   int trunk_branch_id = -1;
   std::vector<int> branch_ids;
   Eigen::Vector3d base = Eigen::Vector3d::Zero();  ///< Trunk axis at the lowest point seen (or ground).
+  double base_sigma_m = 0.0;           ///< Of the ground's height below it; 0 where the ground was not seen.
   double dbh_height_m = 1.3;
   std::optional<double> dbh_m;         ///< Diameter at breast height; absent when not seen.
   double dbh_sigma_m = 0.0;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <optional>
 #include <utility>
@@ -8,6 +9,7 @@
 
 #include <Eigen/Core>
 
+#include "dendro_slam/mapping/ground_surface.h"
 #include "dendro_slam/mapping/landmark.h"
 #include "dendro_slam/mapping/tree_model.h"
 #include "dendro_slam/topology/dendrometry.h"
@@ -81,6 +83,9 @@ struct TopologyState {
   int next_cylinder_id = 0;
 };
 
+/// Height of the ground at a place (x, y) of the map [m], as GroundSurface::At gives it.
+using GroundLookup = std::function<std::optional<GroundHeight>(const Eigen::Vector2d&)>;
+
 /// From landmarks to branches to trees.
 ///
 /// Landmarks that continue each other become one branch (a gap between them is bridged by INFERRED
@@ -104,14 +109,14 @@ class TreeTopology {
   /// Builds the model of the confirmed landmarks; the others are left out.
   /// @param landmarks  In the map frame (z up); in any order, ids unique.
   /// @param stamp_ns   Copied to the model.
-  /// @param ground_z_m Height of the ground in the map frame where it is known: trees then stand on
-  ///                   it instead of on the lowest wood seen.
+  /// @param ground     Height of the ground at a place (x, y) of the map, where it is known: trees then
+  ///                   stand on it instead of on the lowest wood seen. May be empty.
   /// @return Cylinders, branches and trees, each sorted by id; branches from base to tip.
   /// @throws std::invalid_argument for landmarks with numbers that are not finite or ids that
   /// repeat.
   TreeModel Build(const std::vector<Landmark>& landmarks,
                   std::int64_t stamp_ns,
-                  std::optional<double> ground_z_m = std::nullopt);
+                  const GroundLookup& ground = nullptr);
 
   const TopologyConfig& config() const { return config_; }
   const TopologyState& state() const { return state_; }

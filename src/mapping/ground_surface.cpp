@@ -1,0 +1,54 @@
+#include "dendro_slam/mapping/ground_surface.h"
+
+#include <cmath>
+
+namespace dendro {
+namespace {
+
+constexpr double kCellM = 1.0;
+constexpr double kMinUp = 0.9;
+constexpr double kMaxHeightM = 5.0;
+constexpr double kMaxReachM = 10.0;
+constexpr int kMinScans = 10;
+// A plane counts half at this distance, and a sixteenth less with every doubling.
+constexpr double kHalfWeightM = 3.0;
+// What all planes may be wrong by together: pose and mounting height, grass.
+constexpr double kFloorM = 0.02;
+
+}  // namespace
+
+void GroundSurface::Add(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
+  const Eigen::Vector3d normal = T_map_lidar.linear() * ground.normal.cast<double>();
+  const Eigen::Vector3d lidar = T_map_lidar.translation();
+  if (!(normal.z() >= kMinUp) || !(ground.offset <= kMaxHeightM) || !lidar.allFinite()) return;
+  const Eigen::Vector2d foot = lidar.head<2>();
+  Patch& patch = patches_[{static_cast<int>(std::floor(foot.x() / kCellM)),
+                           static_cast<int>(std::floor(foot.y() / kCellM))}];
+  ++patch.count;
+  patch.foot += foot;
+  patch.z_m += lidar.z() - ground.offset / normal.z();
+  patch.slope -= normal.head<2>() / normal.z();
+}
+
+std::optional<GroundHeight> GroundSurface::At(const Eigen::Vector2d& place) const {
+  int scans = 0;
+  double weights = 0.0, mean = 0.0, square = 0.0;
+  for (const auto& [cell, patch] : patches_) {
+    const double share = 1.0 / patch.count;
+    const Eigen::Vector2d off = place - share * patch.foot;
+    const double distance = off.norm();
+    if (distance > kMaxReachM) continue;
+    scans += patch.count;
+    const double z = share * (patch.z_m + patch.slope.dot(off));
+    const double weight = 1.0 / (1.0 + std::pow(distance / kHalfWeightM, 4));
+    // Welford's update with weights (West 1979): no difference of large numbers.
+    weights += weight;
+    const double step = z - mean;
+    mean += weight / weights * step;
+    square += weight * step * (z - mean);
+  }
+  if (scans < kMinScans) return std::nullopt;
+  return GroundHeight{mean, std::hypot(kFloorM, std::sqrt(square / weights))};
+}
+
+}  // namespace dendro
