@@ -224,6 +224,9 @@ def main():
         truth = Truth(arguments.truth) if arguments.truth else None
         scores = evaluate(map_dir, truth) if truth else None
         tape = compare_tape(arguments.tape, map_dir) if arguments.tape else None
+        for row in tape or []:
+            if row["doubt"]:
+                print(f"report: {arguments.tape}: {row['doubt']}", file=sys.stderr)
         thesis = thesis_table(map_dir, truth) if truth else None
         scan = chosen_scan(arguments, map_dir) if arguments.bag else None
         name = arguments.output or os.path.join(arguments.map_dir, "report")

@@ -15,6 +15,9 @@ PLACES = ("branch", "height")
 SIZES = ("radius_cm", "circumference_cm")
 OPTIONAL = ("tree", "position_m", "name", "low_cm", "high_cm")
 MAX_RADIUS_CM = 300.0
+# Readings that are this many times the map's radius, within 15 %, were probably meant otherwise.
+MISTAKES = ((10.0, "is it in mm?"), (2.0, "is it a diameter?"), (2.0 * math.pi, "is it a circumference?"), (0.01, "is it in metres?"),
+            (1.0 / (2.0 * math.pi), "is it a radius?"), (1.0 / 2.54, "is it in inches?"))
 
 
 def read_tape(path):
@@ -29,6 +32,9 @@ def read_tape(path):
         raise InputError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
+    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            raise InputError(f"{path}: line 1: the fields are parted by {called}; expected commas")
     for name in header:
         if name not in PLACES + SIZES + OPTIONAL:
             hint = next((f" (did you mean {k}?)" for k in PLACES + SIZES
@@ -85,7 +91,10 @@ def read_tape(path):
 
 
 def compare_tape(path, map_dir):
-    """Rows {name, place, tape_m, map_m, sigma_m, difference_m}; map_m None with a reason where unseen."""
+    """Rows {name, place, tape_m, map_m, sigma_m, difference_m, note}.
+
+    map_m is None with a reason where nothing was seen; the note also says which line looks like a wrong unit.
+    """
     branches = {b.key: b for b in map_dir.branches or []}
     trunks = {b.tree: b for b in map_dir.branches or [] if b.order == 0 and b.tree is not None}
     base_z = {int(r["tree_id"]): float(r["z"]) for r in map_dir.trees or []}
@@ -112,6 +121,11 @@ def compare_tape(path, map_dir):
             if branch is None:
                 raise InputError(f"{path}: line {line}: the map has no tree {tree}")
             place = f"trunk of tree {tree} at {entry['height']:g} m"
+            seen = float(max(branch.chain.start[:, 2].max(), branch.chain.end[:, 2].max())) - \
+                base_z.get(tree, float(branch.chain.start[0, 2]))
+            if entry["height"] > 3.0 * seen and entry["height"] > 10.0:
+                raise InputError(f"{path}: line {line}: height {entry['height']:g} m is far above tree {tree}, "
+                                 f"whose trunk was seen up to {seen:.1f} m: is it in cm?")
             z = base_z.get(tree, float(branch.chain.start[0, 2])) + entry["height"]
             index, radius = None, None
             for i in range(len(branch.chain.lengths)):
@@ -122,7 +136,7 @@ def compare_tape(path, map_dir):
                                    (z - z0) / (z1 - z0) * (branch.chain.r1[i] - branch.chain.r0[i]))
                     break
         row = {"name": entry["name"] or place, "place": place, "tape_m": entry["radius_m"],
-               "map_m": None, "sigma_m": None, "difference_m": None, "note": ""}
+               "map_m": None, "sigma_m": None, "difference_m": None, "note": "", "doubt": None}
         if index is None:
             row["note"] = "not seen there"
         else:
@@ -130,5 +144,9 @@ def compare_tape(path, map_dir):
                        difference_m=radius - entry["radius_m"])
             if not branch.measured[index]:
                 row["note"] = "inferred"
+            times = entry["radius_m"] / radius if radius > 0.0 else 1.0
+            question = next((q for factor, q in MISTAKES if 1 / 1.15 < times / factor < 1.15), None)
+            if question:
+                row["doubt"] = row["note"] = f"line {line}: {times:.3g} times the map's radius: {question}"
         result.append(row)
     return result

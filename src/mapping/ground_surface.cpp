@@ -30,7 +30,7 @@ void GroundSurface::Add(const GroundPlane& ground, const Eigen::Isometry3d& T_ma
   patch.slope -= normal.head<2>() / normal.z();
 }
 
-std::optional<GroundHeight> GroundSurface::At(const Eigen::Vector2d& place) const {
+std::optional<GroundLevel> GroundSurface::At(const Eigen::Vector2d& place) const {
   int scans = 0;
   double weights = 0.0, mean = 0.0, square = 0.0;
   for (const auto& [cell, patch] : patches_) {
@@ -48,7 +48,7 @@ std::optional<GroundHeight> GroundSurface::At(const Eigen::Vector2d& place) cons
     square += weight * step * (z - mean);
   }
   if (scans < kMinScans) return std::nullopt;
-  return GroundHeight{mean, std::hypot(kFloorM, std::sqrt(square / weights))};
+  return GroundLevel{mean, std::hypot(kFloorM, std::sqrt(square / weights))};
 }
 
 }  // namespace dendro

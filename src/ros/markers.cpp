@@ -215,9 +215,31 @@ int SidesFor(std::size_t cylinders, int max_triangles) {
 
 struct Label {
   std::string text;
-  Eigen::Vector3d anchor = Eigen::Vector3d::Zero();  ///< What it names.
+  Eigen::Vector3d anchor = Eigen::Vector3d::Zero();   ///< What it names.
+  Eigen::Vector2d outward = Eigen::Vector2d::Zero();  ///< Unit, away from the tree's axis.
   int id = 0;
 };
+
+/// The middle of the widest gap between the branches of a tree, seen from above: there a label of the
+/// trunk stands in front of no other wood.
+Eigen::Vector2d FreeDirection(const dendro::TreeModel& model, int tree_id, const Eigen::Vector2d& axis) {
+  std::vector<double> angles;
+  for (const dendro::MapBranch& branch : model.branches) {
+    const Eigen::Vector2d run = branch.tip.head<2>() - axis;
+    if (branch.tree_id != tree_id || branch.order != 1 || run.norm() < 0.1) continue;
+    angles.push_back(std::atan2(run.y(), run.x()));
+  }
+  if (angles.empty()) return Eigen::Vector2d::UnitX();
+  std::sort(angles.begin(), angles.end());
+  double widest = 0.0, middle = 0.0;
+  for (std::size_t i = 0; i < angles.size(); ++i) {
+    const double next = i + 1 < angles.size() ? angles[i + 1] : angles.front() + 2.0 * M_PI;
+    if (next - angles[i] <= widest) continue;
+    widest = next - angles[i];
+    middle = 0.5 * (angles[i] + next);
+  }
+  return {std::cos(middle), std::sin(middle)};
+}
 
 /// Heights in steps of a label's own, each given once.
 class LabelHeights {
@@ -243,6 +265,11 @@ class LabelHeights {
 
 /// The labels of a tree (-1: of what is attached to none), the most important first.
 std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id) {
+  Eigen::Vector2d axis = Eigen::Vector2d::Zero();
+  for (const dendro::MapTree& tree : model.trees) {
+    if (tree.id == tree_id) axis = tree.base.head<2>();
+  }
+  const Eigen::Vector2d free = FreeDirection(model, tree_id, axis);
   std::vector<const dendro::MapBranch*> branches;
   for (const dendro::MapBranch& branch : model.branches) {
     if (branch.tree_id == tree_id) branches.push_back(&branch);
@@ -259,12 +286,16 @@ std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id) {
     });
     if (tree != model.trees.end() && tree->dbh_m) {
       label.anchor = tree->base + Eigen::Vector3d::UnitZ() * tree->dbh_height_m;
+      label.outward = free;
       label.text = fmt::format("tree {}: DBH {:.1f} \u00b1 {:.1f} cm",
                                tree->id,
                                100.0 * *tree->dbh_m,
                                100.0 * tree->dbh_sigma_m);
     } else {
-      label.anchor = 0.5 * (branch->base + branch->tip);
+      // At its free end, where a line to the label crosses no other wood.
+      label.anchor = branch->order == 0 ? 0.5 * (branch->base + branch->tip) : branch->tip;
+      const Eigen::Vector2d run = label.anchor.head<2>() - axis;
+      label.outward = branch->order == 0 || run.norm() < 0.1 ? free : Eigen::Vector2d(run.normalized());
       label.text = fmt::format("b{}: {:.1f} \u00b1 {:.1f} cm",
                                branch->id,
                                100.0 * branch->base_radius_m,
@@ -281,7 +312,8 @@ void AppendLabels(const dendro::TreeModel& model,
                   const std::string& frame_id,
                   visualization_msgs::MarkerArray* markers) {
   constexpr double kStep = 1.25;        // of a label's height
-  constexpr double kOutward = 3.0;      // of a label's height
+  constexpr double kOutward = 2.0;      // of a label's height
+  constexpr double kHalfLetter = 0.28;  // half a letter's width, of its height
   constexpr double kLeaderWidthM = 0.006;
   const std_msgs::ColorRGBA soft = ToColor({200, 200, 200}, 0.8F);
   visualization_msgs::Marker leaders = MakeMarker(model.stamp_ns,
@@ -292,19 +324,14 @@ void AppendLabels(const dendro::TreeModel& model,
   leaders.scale.x = kLeaderWidthM;
   leaders.color = soft;
   LabelHeights heights(kStep * style.label_height_m);
-  Eigen::Vector2d axis = Eigen::Vector2d::Zero();
-  for (const dendro::MapTree& tree : model.trees) {
-    if (tree.id == tree_id) axis = tree.base.head<2>();
-  }
   for (const Label& label : LabelsOf(model, tree_id)) {
     const std::optional<double> height = heights.Take(label.anchor.z() + style.label_height_m);
     if (!height) continue;
-    // Out of the crown's middle, where the letters would stand in the wood.
+    // Beyond the wood by half its own width: its letters stand before the background, not on wood.
+    const double clear =
+        (kOutward + kHalfLetter * static_cast<double>(label.text.size())) * style.label_height_m;
     Eigen::Vector3d at = label.anchor;
-    const Eigen::Vector2d outward = label.anchor.head<2>() - axis;
-    if (outward.norm() > 1e-3) {
-      at.head<2>() += kOutward * style.label_height_m * outward.normalized();
-    }
+    at.head<2>() += clear * label.outward;
     at.z() = *height;
     visualization_msgs::Marker text = MakeMarker(model.stamp_ns,
                                                  frame_id,

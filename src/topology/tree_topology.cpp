@@ -1021,7 +1021,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     state_.origins = std::move(origins);
   }
   std::vector<std::vector<KeyedSection>> sections(n);
-  std::vector<std::optional<GroundHeight>> foot_of(n);
+  std::vector<std::optional<GroundLevel>> foot_of(n);
   for (const int c : sequence) {
     const Chain& chain = chains[c];
     const int num_links = static_cast<int>(chain.links.size());

@@ -179,6 +179,9 @@ def test_one_scan_through_the_stages(tmp_path):
     ("branch,radius_cm,circumference_cm\n1,,\n", ["line 2", "radius_cm or circumference_cm"]),
     ("branch,radius_cm,position_m\n1,6,9\n", ["line 2", "position_m"]),
     ("branch,radius_cm\n", ["no measurement"]),
+    ("branch;radius_cm\n1;6\n", ["line 1", "semicolons"]),
+    ("height,radius_cm\n1.3,19\n130,19\n", ["line 3", "height 130", "cm?"]),
+    ('branch,radius_cm\n1,"6,1"\n', ["line 2", "'6,1'"]),
 ])
 def test_bad_tape_names_the_line(tmp_path, text, words):
     write_map(tmp_path / "map")
@@ -188,3 +191,19 @@ def test_bad_tape_names_the_line(tmp_path, text, words):
     for word in words:
         assert word in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("reading, question", [
+    ("60", "in mm?"), ("37.7", "a circumference?"), ("12", "a diameter?"), ("2.36", "in inches?"), ("6.4", None),
+])
+def test_tape_in_another_unit_is_doubted_by_its_line(tmp_path, reading, question):
+    write_map(tmp_path / "map")
+    (tmp_path / "tape.csv").write_text(f"branch,radius_cm\n2,5\n1,{reading}\n")
+    rows = compare_tape(str(tmp_path / "tape.csv"), MapDirectory(str(tmp_path / "map")))
+    assert rows[0]["doubt"] is None
+    if question is None:
+        assert rows[1]["doubt"] is None
+    else:
+        assert "line 3" in rows[1]["doubt"] and question in rows[1]["doubt"]
+    # The difference is given all the same: it may be the map that is wrong.
+    assert rows[1]["difference_m"] == pytest.approx(0.06 - float(reading) / 100, abs=1e-6)

@@ -452,7 +452,7 @@ TEST(TreeTopology, GroundGivesTheTreeItsFoot) {
   std::vector<Landmark> landmarks = {MakeLandmark(0, {0, 0, 0.6}, {0, 0, 4.0}, 0.2, 0.166)};
   TreeTopology topology{TopologyConfig()};
   const TreeModel model =
-      topology.Build(landmarks, 0, [](const auto&) { return GroundHeight{0.1, 0.0}; });
+      topology.Build(landmarks, 0, [](const auto&) { return GroundLevel{0.1, 0.0}; });
   ASSERT_EQ(model.trees.size(), 1u);
   EXPECT_NEAR(model.trees[0].base.z(), 0.1, 1e-9);
   EXPECT_NEAR(model.trees[0].height_m, 3.9, 1e-9);
@@ -469,7 +469,7 @@ TEST(TreeTopology, TreesOnASlopeStandOnTheirOwnGround) {
   }
   TreeTopology topology{TopologyConfig()};
   const TreeModel model = topology.Build(landmarks, 0, [](const Vector2d& place) {
-    return GroundHeight{0.3 * place.x(), 0.05};
+    return GroundLevel{0.3 * place.x(), 0.05};
   });
   ASSERT_EQ(model.trees.size(), 3u);
   for (int i = 0; i < 3; ++i) {
@@ -483,7 +483,7 @@ TEST(TreeTopology, TreesOnASlopeStandOnTheirOwnGround) {
   }
   // Where the ground was not seen, the base is the lowest wood.
   TreeTopology blind{TopologyConfig()};
-  const TreeModel none = blind.Build(landmarks, 0, [](const Vector2d&) -> std::optional<GroundHeight> {
+  const TreeModel none = blind.Build(landmarks, 0, [](const Vector2d&) -> std::optional<GroundLevel> {
     return std::nullopt;
   });
   ASSERT_EQ(none.trees.size(), 3u);

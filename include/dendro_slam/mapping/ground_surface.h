@@ -12,7 +12,7 @@
 namespace dendro {
 
 /// Height of the ground at a place of the map.
-struct GroundHeight {
+struct GroundLevel {
   double z_m = 0.0;      ///< Map frame.
   double sigma_m = 0.0;  ///< Standard deviation: how much the walk's planes disagree there.
 };
@@ -32,7 +32,7 @@ class GroundSurface {
 
   /// @param place  x, y in the map frame [m].
   /// @return Nothing where fewer than ten scans were taken within 10 m.
-  std::optional<GroundHeight> At(const Eigen::Vector2d& place) const;
+  std::optional<GroundLevel> At(const Eigen::Vector2d& place) const;
 
   void Clear() { patches_.clear(); }
 

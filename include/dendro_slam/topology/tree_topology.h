@@ -84,7 +84,7 @@ struct TopologyState {
 };
 
 /// Height of the ground at a place (x, y) of the map [m], as GroundSurface::At gives it.
-using GroundLookup = std::function<std::optional<GroundHeight>(const Eigen::Vector2d&)>;
+using GroundLookup = std::function<std::optional<GroundLevel>(const Eigen::Vector2d&)>;
 
 /// From landmarks to branches to trees.
 ///
