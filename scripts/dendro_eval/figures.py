@@ -183,8 +183,9 @@ def taper_figure(map_dir, tree, true_trunk=None):
                     label=f"DBH {100 * dbh:.1f} ± {100 * dbh_sigma:.1f} cm at {dbh_height:g} m")
     ax.set_xlabel("diameter of the trunk [cm]")
     ax.set_ylabel("height above the tree's base [m]")
-    ax.set_xlim(left=0)
-    ax.set_ylim(bottom=min(0.0, float(height.min())) - 0.1)
+    # A single piece has no range of its own: some air beside and above it.
+    ax.set_xlim(0, max(ax.get_xlim()[1], 1.2 * float(diameter.max())))
+    ax.set_ylim(min(0.0, float(height.min())) - 0.1, max(ax.get_ylim()[1], float(height.max()) + 0.5))
     ax.set_title(f"Stem taper of {tree_title(tree)}")
     ax.legend(loc="best", fontsize=8.5)
     fig.tight_layout()
@@ -350,8 +351,8 @@ def coverage_figure(map_dir):
             ax.set_xlabel("side that was seen [°]: 0 and 360 the upper side, 180 the lower")
             ax.set_title("Lying branches: seen from above, below or a side" + more)
     fig.tight_layout(rect=(0, 0, 0.9, 1))
-    bar = fig.colorbar(picture, cax=fig.add_axes([0.92, 0.25, 0.018, 0.5]))
-    bar.set_label("share of the measured length")
+    bar = fig.colorbar(picture, cax=fig.add_axes([0.92, 0.2, 0.018, 0.6]))
+    bar.set_label("share of the length", fontsize=8.5)
     return fig
 
 

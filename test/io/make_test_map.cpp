@@ -1,4 +1,4 @@
-// Writes a map directory for the tests of the exports: make_test_map DIR small|one|empty|big
+// Writes a map directory for the tests of the exports: make_test_map DIR small|one|empty|big|tall
 
 #include <cmath>
 #include <cstdio>
@@ -40,6 +40,14 @@ int main(int argc, char** argv) {
     files.landmarks = {MakeLandmark(0, {0, 0, 0}, {0, 0, 0.2}, 0.1, 0.1)};
   } else if (kind == "big") {
     for (int i = 0; i < 240; ++i) add_tree(8.0 * (i % 16), 8.0 * (i / 16), 10);
+  } else if (kind == "tall") {
+    // Ten thousand cylinders on one tree.
+    files.landmarks.push_back(MakeLandmark(0, {0, 0, 0}, {0, 0, 100}, 1.0, 0.2));
+    for (int i = 0; i < 150; ++i) {
+      const Eigen::Vector3d d(std::cos(2.4 * i), std::sin(2.4 * i), 0.4);
+      const Eigen::Vector3d base(0, 0, 5.0 + 0.6 * i);
+      files.landmarks.push_back(MakeLandmark(1 + i, base + 1.1 * d, base + 16.1 * d, 0.1, 0.03));
+    }
   } else if (kind != "empty") {
     return 2;
   }
@@ -63,7 +71,7 @@ int main(int argc, char** argv) {
     files.points.back().position = position;
     files.points.back().label = label;
   };
-  if (kind == "small" || kind == "big") {
+  if (kind == "small" || kind == "big" || kind == "tall") {
     for (const MapCylinder& c : files.model.cylinders) {
       const auto basis = PerpendicularBasis(c.Axis());
       for (int i = 0; i < 20; ++i) {

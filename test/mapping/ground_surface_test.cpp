@@ -35,7 +35,7 @@ TEST(GroundSurface, ASlopeIsExactEverywhereAroundTheWalk) {
   const auto slope = [](double x, double y) { return 0.7 + 0.25 * x - 0.1 * y; };
   GroundSurface surface;
   for (int i = 0; i < 60; ++i) See(slope, 0.2 * i, std::sin(0.2 * i), 0.1 * i, 0.02 * (i % 7), &surface);
-  for (const Eigen::Vector2d place : {Eigen::Vector2d(0, 3), Eigen::Vector2d(6, -4), Eigen::Vector2d(13, 2)}) {
+  for (const Eigen::Vector2d& place : {Eigen::Vector2d(0, 3), Eigen::Vector2d(6, -4), Eigen::Vector2d(13, 2)}) {
     const auto ground = surface.At(place);
     ASSERT_TRUE(ground);
     EXPECT_NEAR(ground->z_m, slope(place.x(), place.y()), 1e-4);

@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.io
+import scipy.spatial
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
@@ -22,10 +23,14 @@ EXPORT = os.path.join(BUILD, "devel", "lib", "dendro_slam", "export_map")
 MAKE = os.path.join(BUILD, "test", "make_test_map")
 
 
+# Two trees and a piece on its own; one cylinder; none; 240 trees of 50 cylinders; one tree of 10 000.
+KINDS = ("small", "one", "empty", "big", "tall")
+
+
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
     root = tmp_path_factory.mktemp("maps")
-    for kind in ("small", "one", "empty", "big"):
+    for kind in KINDS:
         subprocess.run([MAKE, str(root / kind), kind], check=True, stdout=subprocess.DEVNULL)
     return root
 
@@ -52,11 +57,11 @@ def frustum(row):
     return math.pi * float(row["length_m"]) / 3 * (a * a + a * b + b * b)
 
 
-def same_points(a, b):
+def same_points(a, b, tolerance=1e-5):
     """The same points in any order, to the tables' last digit."""
     a, b = np.asarray(a, float), np.asarray(b, float)
-    distance = np.linalg.norm(a[:, None] - b[None], axis=2)
-    return a.shape == b.shape and np.all(distance.min(axis=0) < 1e-5) and np.all(distance.min(axis=1) < 1e-5)
+    return a.shape == b.shape and np.all(scipy.spatial.cKDTree(a).query(b)[0] < tolerance) and \
+        np.all(scipy.spatial.cKDTree(b).query(a)[0] < tolerance)
 
 
 def check_qsm(path, map_dir, tree):
@@ -243,12 +248,13 @@ def read_points(path):
     return np.frombuffer(data, POINTS, n, end)
 
 
-@pytest.mark.parametrize("kind", ["small", "one", "empty", "big"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_las_and_ply_points(maps, tmp_path, kind):
     export(maps / kind, "ply-points", tmp_path / "p.ply")
     points = read_points(tmp_path / "p.ply")
     cylinders = table(maps / kind, "cylinders.csv")
-    expected = {"small": 20 * len(cylinders) + 500 * 7, "big": 20 * len(cylinders)}.get(kind, 0)
+    expected = {"small": 20 * len(cylinders) + 500 * 7, "big": 20 * len(cylinders),
+                "tall": 20 * len(cylinders)}.get(kind, 0)
     assert len(points) == expected
     if kind == "small":
         # Wood points lie on their branch's surface; every branch has its twenty per cylinder.
@@ -290,7 +296,7 @@ def metres_between(a, b):
             d @ [-math.sin(la) * math.cos(lo), -math.sin(la) * math.sin(lo), math.cos(la)])
 
 
-@pytest.mark.parametrize("kind", ["small", "one", "empty", "big"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_geojson(maps, tmp_path, kind):
     # The map's x axis points 30 degrees east of north.
     export(maps / kind, "geojson", tmp_path / "m.json", "--georeference", "33.4214,-111.9280,30,350")
@@ -415,6 +421,90 @@ def test_ten_thousand_cylinders(maps, tmp_path):
     check_qsm(tmp_path / "q.mat", maps / "big", 239)
     export(maps / "big", "ply-sigma", tmp_path / "m.ply")
     assert len(read_ply(tmp_path / "m.ply")[0]) == 26 * len(ours)
+
+
+def starts_and_branches(fmt, path):
+    """(starts (n, 3), lengths (n), branch of each (n), number of roots) of a tree's file, by its own rules."""
+    if fmt == "treeqsm-mat":
+        cylinder = scipy.io.loadmat(path)["QSM"][0, 0]["cylinder"][0, 0]
+        return cylinder["start"], cylinder["length"][:, 0], cylinder["branch"][:, 0], (cylinder["parent"] == 0).sum()
+    if fmt == "treeqsm-txt":
+        values = np.loadtxt(path, skiprows=1, ndmin=2)
+        return values[:, 2:5], values[:, 1], values[:, 10], (values[:, 8] == 0).sum()
+    table_of = rows(path)
+    return (np.array([[float(r[f"start{a}"]) for a in "XYZ"] for r in table_of]),
+            np.array([float(r["length"]) for r in table_of]), np.array([int(r["branchID"]) for r in table_of]),
+            [r["parentID"] for r in table_of].count("-1"))
+
+
+@pytest.mark.parametrize("fmt", ["treeqsm-mat", "treeqsm-txt", "simpleforest"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_tree_has_its_file_and_every_file_all_of_its_tree(maps, tmp_path, fmt, kind):
+    trees = [int(r["tree_id"]) for r in table(maps / kind, "trees.csv")]
+    if not trees:
+        assert "holds no tree" in export(maps / kind, fmt, tmp_path / "t.x", expect=2)
+        assert os.listdir(tmp_path) == []
+        return
+    message = export(maps / kind, fmt, tmp_path / "t.x")
+    loose = sum(r["tree_id"] == "" for r in table(maps / kind, "cylinders.csv"))
+    assert (f"{loose} cylinders that are attached to no tree" in message) == (loose > 0) == (kind == "small")
+    assert len(os.listdir(tmp_path)) == len(trees)
+    ours = {tree: [] for tree in trees}
+    for row in table(maps / kind, "cylinders.csv"):
+        if row["tree_id"]:
+            ours[int(row["tree_id"])].append(row)
+    for tree in trees:
+        path = tmp_path / ("t.x" if len(trees) == 1 else f"t_{tree}.x")
+        starts, lengths, branches, roots = starts_and_branches(fmt, path)
+        assert roots == 1
+        # The text has four digits.
+        assert same_points(starts, [[float(r[f"start_{a}"]) for a in "xyz"] for r in ours[tree]],
+                           1e-4 if fmt == "treeqsm-txt" else 1e-5)
+        assert lengths.sum() == pytest.approx(sum(float(r["length_m"]) for r in ours[tree]), rel=1e-4)
+        assert len(set(branches)) == len({r["branch_id"] for r in ours[tree]})
+        if fmt == "simpleforest":
+            assert set(branches) == {int(r["branch_id"]) for r in ours[tree]}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_formats_of_the_whole_map_hold_all_of_it(maps, tmp_path, kind):
+    cylinders, trees = table(maps / kind, "cylinders.csv"), table(maps / kind, "trees.csv")
+    attached = [r for r in cylinders if r["tree_id"]]
+    message = export(maps / kind, "raycloudtools", tmp_path / "t.txt")
+    assert ("left out" in message) == (len(attached) < len(cylinders))
+    lines = [line for line in (tmp_path / "t.txt").read_text().splitlines() if not line.startswith("#")][1:]
+    assert len(lines) == len(trees)
+    segments = [[float(v) for v in s.split(",")] for line in lines for s in line.split(", ")]
+    assert [s[4] for s in segments].count(-1) == len(trees)
+    if attached:
+        assert same_points([s[:3] for s in segments if s[4] >= 0],
+                           [[float(r[f"end_{a}"]) for a in "xyz"] for r in attached])
+    # The mesh also shows what is attached to no tree.
+    for fmt in ("ply-branch", "ply-order", "ply-sigma"):
+        export(maps / kind, fmt, tmp_path / "m.ply")
+        vertices, _, faces = read_ply(tmp_path / "m.ply")
+        assert len(vertices) == 26 * len(cylinders)
+        a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+        middle = vertices.mean(axis=0) if len(vertices) else 0.0
+        volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
+        assert volume == pytest.approx(sum(frustum(r) for r in cylinders) * 6 / math.pi * 0.5, rel=2e-3)
+    export(maps / kind, "treeloc", tmp_path / "loc", "--every", "20")
+    states = sorted(p for p in os.listdir(tmp_path / "loc") if p.startswith("Tree"))
+    assert len(states) == len(np.loadtxt(tmp_path / "loc" / "trajectory.txt", ndmin=2)) == 2
+    for state in states:
+        # A tree without DBH is there, not reconstructed.
+        there = rows(tmp_path / "loc" / state)
+        assert [float(r["dbh"]) for r in there] == pytest.approx([float(r["dbh_m"] or 0) for r in trees], abs=1e-5)
+        assert [r["reconstructed"] for r in there] == ["1" if r["dbh_m"] else "0" for r in trees]
+    export(maps / kind, "json", tmp_path / "map.json")
+    document = json.loads((tmp_path / "map.json").read_text())
+    assert [c["id"] for c in document["cylinders"]] == sorted(int(r["cylinder_id"]) for r in cylinders)
+    assert len(document["branches"]) == len(table(maps / kind, "branches.csv"))
+    assert sum(c["length_m"] if "length_m" in c else math.dist(c["start"], c["end"])
+               for c in document["cylinders"]) == pytest.approx(sum(float(r["length_m"]) for r in cylinders), abs=1e-2)
+    export(maps / kind, "csv", tmp_path / "tables")
+    for name in ("cylinders.csv", "branches.csv", "trees.csv"):
+        assert (tmp_path / "tables" / name).read_bytes() == (maps / kind / name).read_bytes()
 
 
 def test_tables_and_json_come_back(maps, tmp_path):
