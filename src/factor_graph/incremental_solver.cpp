@@ -99,6 +99,9 @@ class IncrementalSolver::Impl {
                       const UpdateOptions& options);
   UpdateResult OptimizeBatch(const FactorList& new_factors, const Values& new_values);
   FactorId Marginalize(const std::vector<Key>& keys);
+  UpdateResult UpdateMarginalizing(const FactorList& new_factors,
+                                   const Values& new_values,
+                                   const UpdateOptions& options);
 
   const Value& EstimateValue(Key key) const { return graph_.variables[SlotOf(key)].estimate; }
   Values Estimates() const;
@@ -165,6 +168,7 @@ class IncrementalSolver::Impl {
   UpdateResult Iterate(double tolerance, int max_iterations, UpdateResult result);
   Eigen::MatrixXd TangentAtEstimate(int slot) const;
   void TakeOutDamping() const;
+  FactorList Absorb(const std::vector<Key>& keys, std::vector<FactorId>* removed_factors);
 
   SolverConfig config_;
   GraphStore graph_;
@@ -1048,7 +1052,11 @@ UpdateResult IncrementalSolver::Impl::OptimizeBatch(const FactorList& new_factor
 // Marginals
 // -------------------------------------------------------------------------------------------------
 
-FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
+// What variables leave on their neighbours: a linear factor, or none without neighbours.
+// @param removed_factors  In: factors that are to go without leaving anything; out: also all those of
+//                         the variables.
+FactorList IncrementalSolver::Impl::Absorb(const std::vector<Key>& keys,
+                                           std::vector<FactorId>* removed_factors) {
   // The variables to remove, their factors and their neighbours.
   ++stamp_;
   const int removed_stamp = stamp_;
@@ -1059,10 +1067,11 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
     variable_stamp_[v] = removed_stamp;
     removed.push_back(v);
   }
-  if (removed.empty()) return 0;
+  if (removed.empty()) return {};
   std::vector<int> factors;
   std::vector<int> neighbours;
   ++stamp_;
+  for (const FactorId id : *removed_factors) factor_stamp_[FactorSlot(id)] = stamp_;
   for (const int v : removed) {
     for (const int f : graph_.variables[v].factors) {
       if (factor_stamp_[f] == stamp_) continue;
@@ -1146,12 +1155,40 @@ FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
     }
     linear.push_back(std::make_shared<LinearFactor>(names, origins, H_kept, g_kept));
   }
-  UpdateOptions options;
   for (const int f : factors) {
-    options.remove_factors.push_back(MakeFactorId(graph_.factors[f].generation, f));
+    removed_factors->push_back(MakeFactorId(graph_.factors[f].generation, f));
   }
+  return linear;
+}
+
+FactorId IncrementalSolver::Impl::Marginalize(const std::vector<Key>& keys) {
+  UpdateOptions options;
+  const FactorList linear = Absorb(keys, &options.remove_factors);
+  if (options.remove_factors.empty()) return 0;
   const UpdateResult result = Update(linear, {}, options);
   return result.new_factor_ids.empty() ? 0 : result.new_factor_ids.front();
+}
+
+UpdateResult IncrementalSolver::Impl::UpdateMarginalizing(const FactorList& new_factors,
+                                                          const Values& new_values,
+                                                          const UpdateOptions& options) {
+  if (options.marginalize.empty()) return Update(new_factors, new_values, options);
+  for (const FactorPtr& factor : new_factors) {
+    if (!factor) continue;  // Update says so.
+    for (const Key key : factor->keys()) {
+      const auto& gone = options.marginalize;
+      if (std::find(gone.begin(), gone.end(), key) == gone.end()) continue;
+      throw UnknownVariableError(key, factor->Describe() + ": variable " + KeyName(key) +
+                                          " is to be marginalised by the same update; leave one of "
+                                          "the two out");
+    }
+  }
+  UpdateOptions rest = options;
+  FactorList all = new_factors;
+  for (const FactorPtr& linear : Absorb(options.marginalize, &rest.remove_factors)) {
+    all.push_back(linear);
+  }
+  return Update(all, new_values, rest);
 }
 
 // A covariance is that of the measurements: damping is none.
@@ -1254,7 +1291,7 @@ IncrementalSolver& IncrementalSolver::operator=(IncrementalSolver&&) noexcept = 
 UpdateResult IncrementalSolver::Update(const FactorList& new_factors,
                                        const Values& new_values,
                                        const UpdateOptions& options) {
-  return impl_->Update(new_factors, new_values, options);
+  return impl_->UpdateMarginalizing(new_factors, new_values, options);
 }
 
 UpdateResult IncrementalSolver::RemoveFactors(const std::vector<FactorId>& factors) {

@@ -227,7 +227,7 @@ int main(int argc, char** argv) {
       ->capture_default_str()
       ->check(CLI::Range(0.1, kScanRateHz));
   app.add_flag("--consolidate", options.consolidate,
-               "Scans between key frames are marginalised when the next key frame comes, instead of dropped");
+               "Scans between key frames are marginalised once the next key frame is there, instead of dropped");
   app.add_option("--landmarks", options.landmarks,
                  "cylinders: one factor of 5 residuals an observation; parts: axis, normal and curvature factor each on "
                  "its own; points: both ends as points, which other solvers know too")
@@ -268,14 +268,14 @@ int main(int argc, char** argv) {
       for (const Scan::Observation& o : scan.observations) {
         AddObservation(options, run, PoseKey(k), T, o, solver, &factors, &values);
       }
-      const double start = dendro::measure::ThreadCpuSeconds();
-      const dendro::UpdateResult result = solver.Update(factors, values);
+      // The scans before the last key frame leave the graph with the next scan's update.
+      dendro::UpdateOptions update_options;
       const auto interval = static_cast<std::size_t>(KeyFrameStride(options));
-      if (options.consolidate && interval > 1 && k > 0 && k % interval == 0) {
-        std::vector<Key> between;
-        for (std::size_t i = k - interval + 1; i < k; ++i) between.push_back(PoseKey(i));
-        solver.Marginalize(between);
+      if (options.consolidate && interval > 1 && k > 1 && (k - 1) % interval == 0) {
+        for (std::size_t i = k - interval; i + 1 < k; ++i) update_options.marginalize.push_back(PoseKey(i));
       }
+      const double start = dendro::measure::ThreadCpuSeconds();
+      const dendro::UpdateResult result = solver.Update(factors, values, update_options);
       seconds.push_back(dendro::measure::ThreadCpuSeconds() - start);
       relinearized += result.variables_relinearized;
       reeliminated += result.variables_reeliminated;

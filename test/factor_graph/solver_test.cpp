@@ -243,6 +243,34 @@ TEST(Solver, MarginalsAfterARefusedStepAreWithoutItsDamping) {
   EXPECT_LT(solver.Update({}, {}).error_after, result.error_after);
 }
 
+TEST(Solver, MarginalizingWithAnUpdateIsMarginalizingBeforeIt) {
+  const Walk walk = MakeWalk(20, 4, 6);
+  IncrementalSolver before, with;
+  for (std::size_t i = 0; i + 1 < walk.factors.size(); ++i) {
+    before.Update(walk.factors[i], walk.values[i]);
+    with.Update(walk.factors[i], walk.values[i]);
+  }
+  before.Optimize();
+  with.Optimize();
+  const std::vector<Key> old = {X(3), X(4), X(5)};
+  before.Marginalize(old);
+  before.Update(walk.factors.back(), walk.values.back());
+  UpdateOptions options;
+  options.marginalize = old;
+  with.Update(walk.factors.back(), walk.values.back(), options);
+  EXPECT_FALSE(with.Contains(X(4)));
+  EXPECT_EQ(with.num_variables(), before.num_variables());
+  EXPECT_EQ(with.num_factors(), before.num_factors());
+  EXPECT_NEAR(with.Optimize().error_after, before.Optimize().error_after, 1e-9);
+  const Eigen::MatrixXd expected = before.JointMarginalCovariance({X(19), L(0)});
+  EXPECT_LT((with.JointMarginalCovariance({X(19), L(0)}) - expected).norm(), 1e-6 * expected.norm());
+  // A new factor on what goes is refused, and nothing has changed.
+  options.marginalize = {X(19)};
+  const int factors = with.num_factors();
+  EXPECT_THROW(with.Update({walk.factors.back().front()}, {}, options), UnknownVariableError);
+  EXPECT_EQ(with.num_factors(), factors);
+}
+
 TEST(Solver, RemovedFactorsLeaveNoTrace) {
   const Walk walk = MakeWalk(15, 4, 3);
   IncrementalSolver solver;

@@ -59,6 +59,9 @@ using FactorId = std::uint64_t;
 struct UpdateOptions {
   std::vector<FactorId> remove_factors;   ///< Taken out before the new ones go in.
   std::vector<Key> constrained_last;      ///< Kept at the root besides the variables of the new factors.
+  std::vector<Key> marginalize;           ///< As Marginalize does, before the new factors go in (which must
+                                          ///< not name them), but in one elimination with them. Their
+                                          ///< linear factor's id comes after those of the new factors.
   bool converge = false;                  ///< Iterate to the batch optimum, thresholds off.
 };
 
