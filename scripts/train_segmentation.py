@@ -3,6 +3,7 @@
 
   scripts/train_segmentation.py                     simulate data if there is none, train, export
   scripts/train_segmentation.py --resume            go on where an interrupted training stopped
+  scripts/train_segmentation.py --init FILE         train exported weights on, with more or other data
   scripts/train_segmentation.py --evaluate FILE     score a weights file on the held-out scans
   scripts/train_segmentation.py --image 32x360      the same for the thesis' size of image
   scripts/train_segmentation.py --fixture DIR       write the small network the C++ test compares with
@@ -20,9 +21,11 @@ import datetime
 import json
 import os
 import pathlib
+import queue
 import struct
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -34,8 +37,10 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 PROGRAMS = pathlib.Path(os.environ.get("DENDRO_BUILD_DIR", ROOT / "build")) / "devel/lib/dendro_slam"
 CLASSES = ["ground", "wood", "leaf", "other"]
 WOOD, OTHER = 1, 3
-PLANES = 9
-MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE, SIDE = range(PLANES)
+INPUT = "dendro_range_planes_3"
+PLANES = 14
+(MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE, SIDE,
+ WIDTH, BRIGHTNESS, BULGE, SLANT, ROUGHNESS) = range(PLANES)
 IGNORE = 255
 
 LAYERS = ("stem:16:3x5:1x2 push "
@@ -239,7 +244,7 @@ class ErfNet(nn.Module):
             if hasattr(layer, "export"):
                 for name, value in layer.export().items():
                     tensors[f"{i:02d}.{name}"] = value.detach().cpu().float().numpy()
-        metadata = {"format": "dendro_erfnet_1", "input": "dendro_range_planes_2",
+        metadata = {"format": "dendro_erfnet_1", "input": INPUT,
                     "input_channels": str(PLANES), "classes": ",".join(CLASSES),
                     "layers": self.spec}
         return tensors, metadata
@@ -283,6 +288,9 @@ def load_exported(path):
     """A network whose batch normalisations are identities, from an exported file."""
     tensors, metadata = read_safetensors(path)
     net = ErfNet(metadata["layers"])
+    # Planes are only ever added behind the others: a network that knew fewer does not look at them.
+    stem = tensors["00.conv.weight"]
+    tensors["00.conv.weight"] = np.pad(stem, ((0, 0), (0, PLANES - stem.shape[1]), (0, 0), (0, 0)))
 
     def identity(bn, scale=None, shift=None):
         bn.running_mean.zero_()
@@ -315,6 +323,37 @@ def load_exported(path):
     return net.eval()
 
 
+@torch.no_grad()
+def unfold(net, inputs):
+    """Gives the batch normalisations of load_exported() the statistics of `inputs` back.
+
+    The network computes the same at inference, and nearly the same on batches like these in training.
+    """
+    sums = {}
+
+    def measure(bn, args):
+        x = args[0].double()
+        n, total, squares = sums.get(bn, (0, 0.0, 0.0))
+        sums[bn] = (n + x.numel() // x.shape[1], total + x.sum((0, 2, 3)), squares + (x * x).sum((0, 2, 3)))
+
+    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
+    hooks = [bn.register_forward_pre_hook(measure) for bn in norms]
+    net.eval()
+    for x in inputs:
+        net(x)
+    for hook in hooks:
+        hook.remove()
+    for bn in norms:
+        n, total, squares = sums[bn]
+        scale, shift = affine(bn)
+        mean = total / n
+        variance = (squares / n - mean * mean).clamp_min(1e-6)
+        bn.running_mean.copy_(mean)
+        bn.running_var.copy_(variance)
+        bn.weight.copy_(scale * torch.sqrt(variance + bn.eps))
+        bn.bias.copy_(shift + scale * mean)
+
+
 # ---------------------------------------------------------------------------------------------
 # Data
 # ---------------------------------------------------------------------------------------------
@@ -325,7 +364,7 @@ class Dataset:
         self.planes, self.labels, self.scans, self.seeds = [], [], [], []
         for folder in sorted(folders):
             meta = json.loads((folder / "meta.json").read_text())
-            if meta["planes"] != PLANES or meta["input"] != "dendro_range_planes_2":
+            if meta["planes"] != PLANES or meta["input"] != INPUT:
                 raise SystemExit(f"train_segmentation: {folder} holds other planes; simulate anew")
             self.rows, self.cols = meta["rows"], meta["cols"]
             shape = (meta["count"], PLANES, self.rows, self.cols)
@@ -348,7 +387,10 @@ class Dataset:
 
 
 def augment(x, y, rng):
-    """Yaw comes from the crop's place; here mirror, range scale, drop-out, intensity, ground."""
+    """Yaw comes from the crop's place; here mirror, range scale, drop-out, intensity, ground.
+
+    The planes of the runs stay as they are where a return is dropped: they would seldom change much.
+    """
     mask = x[MASK] > 0.5
     if rng.random() < 0.5:
         x, y, mask = x[:, :, ::-1].copy(), y[:, ::-1].copy(), mask[:, ::-1].copy()
@@ -363,8 +405,9 @@ def augment(x, y, rng):
     scale = np.exp(rng.uniform(-0.25, 0.25)) if rng.random() < 0.7 else 1.0
     if scale != 1.0:
         x[RANGE] += mask * (0.5 * np.log2(scale))
+        x[WIDTH] += mask * (0.25 * np.log2(scale))
         x[HEIGHT] = np.clip(x[HEIGHT] * scale, -1.0, 3.0)
-        for plane in (LATERAL, VERTICAL, RISE):
+        for plane in (LATERAL, VERTICAL, RISE, BULGE, SLANT, ROUGHNESS):
             s = x[plane]
             # s = d / (|d| + c) has d / c = s / (1 - |s|).
             d = s / np.maximum(1.0 - np.abs(s), 1e-3) * scale
@@ -383,10 +426,11 @@ def augment(x, y, rng):
         x[:, drop] = 0.0
         y = np.where(drop, IGNORE, y).astype(np.uint8)
     if rng.random() < 0.15:
-        x[INTENSITY] = -0.5 * mask
+        x[INTENSITY] = x[BRIGHTNESS] = -0.5 * mask
     else:
         gain = np.exp(rng.uniform(-0.4, 0.4))
-        x[INTENSITY] = np.clip((x[INTENSITY] + 0.5) * gain, 0.0, 2.0) * mask - 0.5 * mask
+        for plane in (INTENSITY, BRIGHTNESS):
+            x[plane] = np.clip((x[plane] + 0.5) * gain, 0.0, 2.0) * mask - 0.5 * mask
     if rng.random() < 0.1:
         x[HEIGHT] = 0.0
         x[UP] = 0.0
@@ -410,6 +454,21 @@ def batches(data, rng, steps, size, width):
             xs.append(x)
             ys.append(y)
         yield torch.from_numpy(np.stack(xs)), torch.from_numpy(np.stack(ys).astype(np.int64))
+
+
+def ahead(items, depth=4):
+    """The same items, made by a thread of their own while the last one is worked on."""
+    made = queue.Queue(depth)
+    end = object()
+
+    def make():
+        for item in items:
+            made.put(item)
+        made.put(end)
+
+    threading.Thread(target=make, daemon=True).start()
+    while (item := made.get()) is not end:
+        yield item
 
 
 # ---------------------------------------------------------------------------------------------
@@ -541,8 +600,8 @@ def train(args):
     if args.bfloat16 is None:
         args.bfloat16 = bfloat16_is_faster(args, device)
     print(f"training on {device.type} in {'bfloat16' if args.bfloat16 else 'float32'}", flush=True)
-    phases = [("encoder", args.encoder_epochs), ("decoder", args.decoder_epochs),
-              ("joint", args.joint_epochs)]
+    phases = [("encoder", 0 if args.init else args.encoder_epochs),
+              ("decoder", 0 if args.init else args.decoder_epochs), ("joint", args.joint_epochs)]
     total = sum(n for _, n in phases)
     state = {"epoch": 0, "best": -1.0, "best_state": None, "log": [], "seconds": 0.0, "stale": 0}
     checkpoint = args.data / args.checkpoint
@@ -556,6 +615,13 @@ def train(args):
         print(f"resumed after epoch {state['epoch']} of {total}, best {state['best']:.4f}", flush=True)
     else:
         saved = None
+        if args.init:
+            net = load_exported(args.init)
+            if net.spec != args.layers:
+                raise SystemExit("train_segmentation: --init is of another architecture")
+            rng = np.random.default_rng([args.seed, 1 << 20])
+            unfold(net, [x for x, _ in batches(training, rng, 30, args.batch, args.width)])
+            net = net.to(device, memory_format=torch.channels_last)
     picture = list(range(0, held_out.count, max(1, held_out.count // args.held_out_scans)))
     while state["epoch"] < total and state["stale"] < args.patience:
         epoch = state["epoch"]
@@ -584,7 +650,8 @@ def train(args):
         elif epoch == begin:
             state["joint_from"] = state["seconds"]
         started, losses = time.time(), []
-        for step, (x, y) in enumerate(batches(training, rng, args.steps, args.batch, args.width)):
+        for step, (x, y) in enumerate(ahead(batches(training, rng, args.steps, args.batch,
+                                                          args.width))):
             done = epoch - begin + step / args.steps
             warm = min(1.0, (done * args.steps + 1) / 100.0)
             progress = done / length
@@ -675,6 +742,7 @@ Wood, ground, leaf and other in a range image. Written by `scripts/train_segment
 - Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.batch} crops
   {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
   {'bfloat16' if args.bfloat16 else 'float32'}, {state['seconds'] / 60:.0f} min on {args.device}
+- Started from: {args.init or 'random numbers'}
 - Augmentation: yaw (place of the crop), mirror, range scale, drop-out, intensity gain and off, ground unknown
 - Early stopping: the weights with the best wood IoU on a part of the held-out scans ({state['best']:.4f})
 
@@ -741,8 +809,8 @@ def main():
     parser.add_argument("--data", type=pathlib.Path,
                         help="folder of the simulated scans and the checkpoint")
     parser.add_argument("--output", type=pathlib.Path, help="default: config/models/")
-    parser.add_argument("--train-scans", type=int, default=2400)
-    parser.add_argument("--folders", type=int, default=4, help="that the training scans are spread over")
+    parser.add_argument("--train-scans", type=int, default=4800)
+    parser.add_argument("--folders", type=int, default=6, help="that the training scans are spread over")
     parser.add_argument("--test-scans", type=int, default=192)
     parser.add_argument("--held-out-scans", type=int, default=40, help="scored during the training")
     parser.add_argument("--layers")
@@ -760,6 +828,8 @@ def main():
     parser.add_argument("--bfloat16", action=argparse.BooleanOptionalAction, default=None,
                         help="default: if it is faster on this CPU")
     parser.add_argument("--threads", type=int, default=max(1, os.cpu_count() or 1))
+    parser.add_argument("--init", type=pathlib.Path, metavar="FILE",
+                        help="go on from these weights in the joint step, with a new learning rate")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--checkpoint", default="checkpoint.pt")
     parser.add_argument("--resume", action="store_true")

@@ -63,9 +63,14 @@ std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
                                           float max_range) {
   std::vector<std::size_t> pixels;
   pixels.reserve(image.size());
-  for (std::size_t i = 0; i < image.size(); ++i) {
-    if (image.HasReturn(i) && image.range[i] <= max_range && image.point[i].allFinite()) {
-      pixels.push_back(i);
+  // From the reference column on, so that the samples do not depend on where azimuth 0 lies.
+  const int reference = ReferenceColumn(image);
+  for (int row = 0; row < image.rows; ++row) {
+    for (int k = 0; k < image.cols; ++k) {
+      const std::size_t i = image.Index(row, image.WrapColumn(reference + k));
+      if (image.HasReturn(i) && image.range[i] <= max_range && image.point[i].allFinite()) {
+        pixels.push_back(i);
+      }
     }
   }
   if (pixels.size() < 30) return std::nullopt;

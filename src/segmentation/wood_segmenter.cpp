@@ -24,7 +24,6 @@ struct ShippedWeights {
 };
 constexpr std::array<ShippedWeights, 2> kShippedWeights = {
     {{"erfnet_wood.safetensors", 16, 1800}, {"erfnet_wood_32x360.safetensors", 32, 360}}};
-constexpr const char* kInputVersion = "dendro_range_planes_2";
 constexpr const char* kClassList = "ground,wood,leaf,other";
 constexpr int kClasses = 4;
 constexpr int kWoodClass = 1;
@@ -84,7 +83,7 @@ namespace {
 
 ErfNet LoadNetwork(const std::string& path) {
   const TensorFile weights = TensorFile::Load(path);
-  if (weights.Metadata("input") != kInputVersion || weights.Metadata("classes") != kClassList) {
+  if (weights.Metadata("input") != kNetworkInputVersion || weights.Metadata("classes") != kClassList) {
     throw WeightsError(fmt::format("weights file '{}': was trained for another input or other "
                                    "classes", weights.name()));
   }
@@ -150,9 +149,11 @@ struct WoodSegmenter::Impl {
   }
 
   // Lays the chosen columns side by side. Where all columns are chosen the image is closed across
-  // azimuth 0 by repeating the margin on both ends. `writes` marks the columns whose result counts.
+  // its ends by repeating the margin on both. `writes` marks the columns whose result counts. The
+  // reference column comes first: the network's strides then fall alike wherever azimuth 0 lies.
   void LayCanvas(const std::vector<char>& chosen,
                  int cols,
+                 int reference,
                  std::vector<int>* source,
                  std::vector<char>* writes) const {
     const auto wrap = [cols](int c) { return ((c % cols) + cols) % cols; };
@@ -160,13 +161,13 @@ struct WoodSegmenter::Impl {
     if (all) {
       const int margin = std::min(config.margin_columns, cols);
       for (int k = -margin; k < cols + margin; ++k) {
-        source->push_back(wrap(k));
+        source->push_back(wrap(reference + k));
         writes->push_back(k >= 0 && k < cols);
       }
     } else {
-      // Start at the first column behind a gap, so that a sector across azimuth 0 stays whole.
-      int start = 0;
-      while (chosen[static_cast<std::size_t>(start)]) ++start;
+      // Start at the first column behind a gap, so that no sector is torn.
+      int start = reference;
+      while (chosen[static_cast<std::size_t>(start)]) start = wrap(start + 1);
       for (int k = 0; k < cols; ++k) {
         const int col = wrap(start + k);
         if (!chosen[static_cast<std::size_t>(col)]) continue;
@@ -188,7 +189,7 @@ struct WoodSegmenter::Impl {
     if (std::none_of(chosen.begin(), chosen.end(), [](char c) { return c != 0; })) return;
     std::vector<int> source;
     std::vector<char> writes;
-    LayCanvas(chosen, image.cols, &source, &writes);
+    LayCanvas(chosen, image.cols, ReferenceColumn(image), &source, &writes);
     const int width = static_cast<int>(source.size());
     std::vector<float> planes = NetworkInput(image, ground, source);
     // Rows that the network's strides do not divide are padded above the image.

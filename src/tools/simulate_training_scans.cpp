@@ -29,8 +29,8 @@ struct Options {
   int scans = 100;
   int scans_per_scene = 2;
   std::uint64_t seed = 1000;
-  int sub_rays_width = 5;
-  int sub_rays_height = 2;
+  int sub_rays_width = 8;
+  int sub_rays_height = 3;
   std::string kinds =
       "leafy,tilted,leafless,orchard,clutter,tilted,leafy,thesis,tilted,leafy,clutter,tilted";
   dendro::ProjectorConfig projector;
@@ -88,7 +88,7 @@ void Run(const Options& options) {
   labels_file.close();
   // The description comes last: without it the folder counts as unfinished.
   std::ofstream meta(folder / "meta.json");
-  meta << nlohmann::json({{"input", "dendro_range_planes_2"},
+  meta << nlohmann::json({{"input", dendro::kNetworkInputVersion},
                           {"count", done},
                           {"planes", dendro::kNetworkInputChannels},
                           {"rows", options.projector.rows},

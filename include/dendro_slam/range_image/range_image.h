@@ -53,6 +53,11 @@ struct LabelledScan {
   bool IsWood(std::size_t pixel) const { return label[pixel] == Label::kWood; }
 };
 
+/// A column that what is seen singles out, wherever azimuth 0 lies: the one with the largest sum of
+/// ranges. What starts there instead of at column 0 gives the same for a sensor mounted or started at
+/// another azimuth. 0 for an image without returns.
+int ReferenceColumn(const RangeImage& image);
+
 /// Label of every source point in the cloud's order: the label of its pixel (several returns in one
 /// pixel share it), kNone for points that could not be projected.
 std::vector<Label> PointLabels(const LabelledScan& scan);

@@ -24,7 +24,7 @@ struct GroundPlaneConfig {
   double far_range_m = 80.0;        ///< Second try where the nearer returns show no ground: high above
                                     ///< it all of it is far away [m]. 0 to leave it out.
   double min_inlier_ratio = 0.08;  ///< Of the returns considered. In (0, 1).
-  double min_column_ratio = 0.1;    ///< Of the columns, with the plane in sight. In [0, 1).
+  double min_column_ratio = 0.3;    ///< Of the columns, with the plane in sight. In [0, 1).
   double max_below_ratio = 0.04;   ///< Returns that may lie under the plane. In [0, 1).
 
   void Validate() const;
