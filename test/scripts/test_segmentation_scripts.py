@@ -44,3 +44,20 @@ def test_training_from_nothing_and_resumed(tmp_path):
     assert metadata["layers"] == training.LAYERS and len(tensors) > 20
     card = (tmp_path / "weights.md").read_text()
     assert "4 scans to train" in card and "2 epochs joint" in card
+    # Exported weights are trained on in the joint step alone.
+    more = run("--joint-epochs", "1", "--init", str(tmp_path / "weights.safetensors"))
+    assert "[1/1] phase=joint" in more and "phase=encoder" not in more
+
+
+def test_unfolded_weights_compute_what_the_exported_ones_do():
+    import torch
+    net = training.load_exported(ROOT / "config/models/erfnet_wood.safetensors")
+    torch.manual_seed(3)
+    inputs = [torch.randn(2, training.PLANES, 16, 64) for _ in range(3)]
+    with torch.no_grad():
+        expected = net(inputs[0])
+        training.unfold(net, inputs)
+        norm = net.layers[0].bn
+        seen = torch.cat([net.layers[0].conv(x) for x in inputs])
+        assert torch.allclose(norm.running_mean, seen.mean((0, 2, 3)), atol=1e-4)
+        assert torch.allclose(net(inputs[0]), expected, atol=1e-3 * float(expected.abs().max()))
