@@ -95,6 +95,7 @@ class Separation {
   bool BoundedByCloser(const Run& run) const;
   bool HiddenBetween(const Run& a, const Run& b) const;
   void Assign(std::vector<Run> runs, int row);
+  void ReleaseExcess();
   void CutTrack(const std::vector<Run>& runs, std::vector<std::vector<Run>>* pieces) const;
 
   const LabelledScan& scan_;
@@ -412,6 +413,107 @@ void Separation::Assign(std::vector<Run> runs, int row) {
   }
 }
 
+// Where a branch begins, its first returns hang on its parent's run; rows before and after show how
+// wide the parent is and where. What sticks out goes to the branch that goes on there.
+void Separation::ReleaseExcess() {
+  constexpr int kWindow = 3;
+  std::vector<Run> released;
+  for (Track& track : tracks_) {
+    std::vector<Run>& runs = track.runs;
+    const auto count = static_cast<int>(runs.size());
+    std::vector<std::pair<int, int>> kept(runs.size());  // First and last column.
+    for (int i = 0; i < count; ++i) {
+      const Run& run = runs[static_cast<std::size_t>(i)];
+      kept[static_cast<std::size_t>(i)] = {run.first, run.last};
+      double width[2 * kWindow], centre[2 * kWindow], row[2 * kWindow];
+      int n = 0;
+      bool alone = true;
+      for (int k = std::max(0, i - kWindow); k <= std::min(count - 1, i + kWindow); ++k) {
+        if (k == i) continue;
+        const Run& other = runs[static_cast<std::size_t>(k)];
+        if (other.row == run.row) alone = false;
+        width[n] = other.width() * other.range / run.range;
+        centre[n] = 0.5 * (other.first + other.last);
+        row[n] = other.row;
+        ++n;
+      }
+      if (n < 2 || !alone) continue;
+      double sorted[2 * kWindow];
+      std::copy(width, width + n, sorted);
+      std::sort(sorted, sorted + n);
+      const double usual = n % 2 == 1 ? sorted[n / 2] : 0.5 * (sorted[n / 2 - 1] + sorted[n / 2]);
+      if (run.width() < config_.excess_width_ratio * usual) continue;
+      // The line through the centres of the rows of usual width with the least median distance.
+      double best = std::numeric_limits<double>::infinity(), expected = 0.0;
+      for (int a = 0; a < n; ++a) {
+        for (int b = a + 1; b < n; ++b) {
+          if (row[a] == row[b] || width[a] > 1.3 * usual || width[b] > 1.3 * usual) continue;
+          const double slope = (centre[b] - centre[a]) / (row[b] - row[a]);
+          double off[2 * kWindow];
+          for (int k = 0; k < n; ++k) {
+            off[k] = std::abs(centre[k] - centre[a] - slope * (row[k] - row[a]));
+          }
+          std::nth_element(off, off + n / 2, off + n);
+          // Of equals the pair around this row.
+          const double cost = off[n / 2] + 0.01 * std::abs(row[a] + row[b] - 2.0 * run.row);
+          if (cost >= best) continue;
+          best = cost;
+          expected = centre[a] + slope * (run.row - row[a]);
+        }
+      }
+      if (!(best < 0.5 * usual + 1.0)) continue;
+      const int least = config_.excess_min_pixels;
+      const int left = static_cast<int>(std::floor(expected - 0.5 * (usual - 1.0) - 0.5));
+      const int right = static_cast<int>(std::ceil(expected + 0.5 * (usual - 1.0) + 0.5));
+      if (left - run.first >= least && left < run.last) kept[static_cast<std::size_t>(i)].first = left;
+      if (run.last - right >= least && right > run.first) kept[static_cast<std::size_t>(i)].second = right;
+    }
+    for (int i = 0; i < count; ++i) {
+      const auto k = static_cast<std::size_t>(i);
+      const Run run = runs[k];
+      const auto [first, last] = kept[k];
+      if (first == run.first && last == run.last) continue;
+      Run middle = Part(run, first, last);
+      if (middle.pixels.empty()) continue;
+      for (Run part : {Part(run, run.first, first - 1), Part(run, last + 1, run.last)}) {
+        if (!part.pixels.empty()) released.push_back(std::move(part));
+      }
+      runs[k] = std::move(middle);
+    }
+  }
+  for (Run& part : released) {
+    // The nearest branch that ends in the row before or begins in the row after.
+    Track* owner = nullptr;
+    double nearest = std::numeric_limits<double>::infinity();
+    bool at_end = false;
+    for (Track& track : tracks_) {
+      for (const bool end : {true, false}) {
+        const Run& other = end ? track.runs.back() : track.runs.front();
+        const int step = end ? part.row - other.row : other.row - part.row;
+        if (step < 1 || step > 1 + config_.max_missing_rows) continue;
+        const double spacing = RowSpacing(part.row, other.row, part.first, part.range);
+        const double limit =
+            std::hypot(spacing, spacing * max_row_tan_) + 4.0 * config_.range_sigma_m;
+        const double distance = MinDistance(part, other);
+        if (distance > limit || distance >= nearest) continue;
+        nearest = distance;
+        owner = &track;
+        at_end = end;
+      }
+    }
+    if (owner == nullptr) {
+      tracks_.emplace_back();
+      tracks_.back().runs.push_back(std::move(part));
+    } else if (at_end) {
+      owner->runs.push_back(Shifted(part, 0.5 * (owner->runs.back().first + owner->runs.back().last)));
+    } else {
+      owner->runs.insert(
+          owner->runs.begin(),
+          Shifted(part, 0.5 * (owner->runs.front().first + owner->runs.front().last)));
+    }
+  }
+}
+
 // Cuts a chain of runs until every piece is short and straight enough for one cone.
 void Separation::CutTrack(const std::vector<Run>& runs, std::vector<std::vector<Run>>* pieces) const {
   // One node per row.
@@ -495,6 +597,7 @@ std::vector<Segment> Separation::Adaptive() {
     if (runs.empty()) continue;
     Assign(CutAtForks(std::move(runs), row), row);
   }
+  ReleaseExcess();
   std::vector<Segment> segments;
   std::vector<std::vector<Run>> pieces;
   for (const Track& track : tracks_) {
@@ -563,6 +666,8 @@ void BranchSeparatorConfig::Validate() const {
   Require(max_missing_rows >= 0, "max_missing_rows", ">= 0");
   Require(std::isfinite(fork_width_ratio) && fork_width_ratio > 1.0, "fork_width_ratio", "> 1");
   Require(fork_min_excess_pixels >= 1, "fork_min_excess_pixels", ">= 1");
+  Require(std::isfinite(excess_width_ratio) && excess_width_ratio > 1.0, "excess_width_ratio", "> 1");
+  Require(excess_min_pixels >= 1, "excess_min_pixels", ">= 1");
   Require(positive(max_length_m), "max_length_m", "> 0");
   Require(positive(max_bow_m), "max_bow_m", "> 0");
   Require(min_rows_per_piece >= 1, "min_rows_per_piece", ">= 1");

@@ -26,6 +26,12 @@ constexpr double kConverged = 1e-3;
 constexpr double kLargestCycle = 25.0;
 // A footprint of thin rays still leaves the silhouette this uncertain a width [m].
 constexpr double kThinnestBeam = 1e-3;
+constexpr int kFewRings = 6;
+constexpr double kShortest = 4.0;  // Length over radius.
+// Returns of one branch farther apart in time lie on both sides of where a revolution begins.
+constexpr float kLongSight_s = 0.02F;
+// Sine of the angle to the axis from which two neighbours see the silhouette and not an end.
+constexpr double kLeastCrossing = 0.25;
 
 // The state of the final estimator: the bent cone's tangent space and the error of the share of a
 // beam that makes a return, which shifts all edges by that part of the beam's width.
@@ -225,6 +231,7 @@ class SegmentFit {
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();  // Mean optical centre.
   Eigen::Vector3d centroid_ = Eigen::Vector3d::Zero();
   double bright_ = 0.0;  // Intensity of a full hit.
+  float first_time_s_ = 0.0F, last_time_s_ = 0.0F;  // Of the returns.
   int num_rings_ = 0;
   int non_finite_ = 0;
 };
@@ -264,6 +271,9 @@ bool SegmentFit::Collect() {
     beam.point = p.cast<double>();
     if (beam.row != last_row) ++num_rings_;
     last_row = beam.row;
+    const float time_s = image_.time_s.size() == image_.size() ? image_.time_s[pixel] : 0.0F;
+    first_time_s_ = beams_.empty() ? time_s : std::min(first_time_s_, time_s);
+    last_time_s_ = beams_.empty() ? time_s : std::max(last_time_s_, time_s);
     beams_.push_back(beam);
     centroid_ += beam.point;
     origin_ += beam.origin;
@@ -553,7 +563,7 @@ void SegmentFit::Linearise(Estimate* estimate,
     const double width = side * (miss.offset - hit.offset);
     // Only neighbours across the axis see the silhouette; one along it sees an end.
     const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
-    if (width < 0.5 * apart || side * miss.offset < 0.0) continue;
+    if (width < kLeastCrossing * apart || side * miss.offset < 0.0) continue;
     double hit_Y = 1.0, miss_Y = 1.0;
     const Footprint footprint = FootprintOf(cone, edge.hit);
     const double beam_width = std::max(2.0 * footprint.half_width_m, kThinnestBeam);
@@ -665,6 +675,13 @@ void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
   to_cylinder(4, kRadius) = -1.0 / (cone.radius * cone.radius);
   out->covariance = to_cylinder * estimate.covariance * to_cylinder.transpose();
   out->covariance = 0.5 * (out->covariance + out->covariance.transpose()).eval();
+  if (last_time_s_ - first_time_s_ > kLongSight_s) {
+    // One side was seen a revolution after the other: what the odometry errs in between moves one
+    // silhouette, and with it the radius and the position by half of that.
+    const double half = 0.5 * config_.revolution_sigma_m;
+    out->covariance.diagonal().segment<2>(2).array() += half * half;
+    out->covariance(4, 4) += half * half * std::pow(cone.radius, -4.0);
+  }
   out->taper_m_per_m = cone.slope;
   out->taper_sigma_m_per_m = std::sqrt(estimate.covariance(kSlope, kSlope));
   out->taper_estimated = out->taper_sigma_m_per_m < 0.5 * config_.taper_sigma_m_per_m;
@@ -746,14 +763,18 @@ FittedCylinder SegmentFit::Fit() {
   if (out.num_rings < config_.min_rings) return unresolved(UnresolvedReason::kTooFewRings);
   if (estimate.sigma > config_.max_residual_sigma_m ||
       3 * out.num_points < 2 * static_cast<int>(beams_.size()) ||
-      (estimate.edges >= 4 && 2 * estimate.edges_violated > estimate.edges)) {
+      (estimate.edges >= 4 && 3 * estimate.edges_violated > estimate.edges)) {
     return unresolved(UnresolvedReason::kNotACylinder);
   }
   if (out.visible_arc_rad < config_.min_visible_arc_deg * kDegree) {
     return unresolved(UnresolvedReason::kArcTooSmall);
   }
+  // A few rings on something hardly longer than wide: a joint of branches or a leaf.
+  if (out.num_rings < kFewRings && out.end_s_m - out.start_s_m < kShortest * r) {
+    return unresolved(UnresolvedReason::kNotACylinder);
+  }
   const double axis_sigma = std::sqrt(std::max(estimate.covariance(0, 0), estimate.covariance(1, 1)));
-  if (std::sqrt(estimate.covariance(kRadius, kRadius)) > config_.max_radius_sigma_ratio * r ||
+  if (out.radius_sigma_m() > config_.max_radius_sigma_ratio * r ||
       axis_sigma > config_.max_axis_sigma_deg * kDegree) {
     return unresolved(UnresolvedReason::kUncertain);
   }
@@ -789,6 +810,7 @@ void CylinderFitterConfig::Validate() const {
   Require(not_negative(echo_separation_m), "echo_separation_m", ">= 0");
   Require(positive(detection_sigma), "detection_sigma", "> 0");
   Require(positive(detection_bias_sigma), "detection_bias_sigma", "> 0");
+  Require(not_negative(revolution_sigma_m), "revolution_sigma_m", ">= 0");
   Require(not_negative(ring_bias_sigma_m), "ring_bias_sigma_m", ">= 0");
 }
 

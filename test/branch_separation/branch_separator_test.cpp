@@ -117,6 +117,25 @@ TEST(BranchSeparator, ForkIsTrunkAndBranch) {
   EXPECT_GT(largest[0], trunk_pixels * 9 / 10) << "the trunk goes on past the fork";
 }
 
+// A level twig met by one ring hangs on its trunk's run there; the rings below and above show the trunk.
+TEST(BranchSeparator, OneRowOfATwigIsNotTheTrunks) {
+  TestScan test = SimulateCones({Upright(4, 0.0, 0.1)}, TestSensor(), 3);
+  const int row = 7;
+  int last = -1;  // The trunk lies on both sides of column 0; its highest column there.
+  for (int col = 0; col < 100; ++col) {
+    if (test.truth[test.scan.image.Index(row, col)] == 0) last = col;
+  }
+  ASSERT_GT(last, 0);
+  std::set<std::int32_t> twig;
+  for (int k = 1; k <= 4; ++k) twig.insert(Set(&test, row, last + k, 3.97));
+  const auto segments = BranchSeparator().Separate(test.scan);
+  ASSERT_EQ(segments.size(), 2u);
+  const Segment& trunk = segments[0].pixels.size() > segments[1].pixels.size() ? segments[0] : segments[1];
+  int foreign = 0;
+  for (const std::int32_t p : trunk.pixels) foreign += static_cast<int>(twig.count(p));
+  EXPECT_LE(foreign, 1);
+}
+
 TEST(BranchSeparator, ArmsWithTheBackgroundBetweenThemAreNotOneTrunk) {
   const TestCone trunk = Upright(4, 0.0, 0.17, -1.2, 0.0);
   const TestCone left = Upright(4, 0.11, 0.08, 0.0, 1.2), right = Upright(4, -0.11, 0.08, 0.0, 1.2);

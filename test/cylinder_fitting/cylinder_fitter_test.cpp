@@ -198,6 +198,40 @@ TEST(CylinderFitter, AcrossTheColumnSeam) {
   EXPECT_NEAR(fit.cylinder.radius(), 0.15, 0.004);
 }
 
+TEST(CylinderFitter, HalvesSeenARevolutionApartAreLessSure) {
+  TestScan test = SimulateCones({Upright(4.0, 0.0, 0.15)}, TestSensor(), 3);
+  const Segment segment = SegmentOf(test, 0);
+  const FittedCylinder at_once = CylinderFitter().FitSegment(test.scan, segment);
+  for (std::size_t i = 0; i < test.scan.image.size(); ++i) {
+    test.scan.image.time_s[i] = static_cast<float>(i % 1800) * 0.1F / 1800.0F;
+  }
+  const FittedCylinder apart = CylinderFitter().FitSegment(test.scan, segment);
+  EXPECT_EQ(apart.cylinder.curvature, at_once.cylinder.curvature);
+  const double half = 0.5 * CylinderFitterConfig().revolution_sigma_m;
+  EXPECT_NEAR(apart.radius_sigma_m(), std::hypot(at_once.radius_sigma_m(), half), 1e-6);
+}
+
+// A branch that climbs by a quarter of a right angle: its silhouettes are seen along the rings only.
+TEST(CylinderFitter, NearlyLevelBranchKeepsItsSilhouettes) {
+  constexpr double kRadius = 0.035;
+  const Vector3d along = Vector3d(0.05, 0.9, 0.45).normalized();
+  double sum = 0.0;
+  int n = 0;
+  for (unsigned seed = 1; seed <= 10; ++seed) {
+    const Vector3d centre(4.3, 0.15 * seed - 0.7, 0.1);
+    TestSensor sensor;
+    sensor.azimuth_offset_deg = 0.0371 * seed;
+    const TestScan test = SimulateCones({{centre - 0.6 * along, centre + 0.6 * along, kRadius, kRadius}},
+                                        sensor, seed);
+    const FittedCylinder fit = CylinderFitter().FitSegment(test.scan, SegmentOf(test, 0));
+    if (fit.status != FitStatus::kMeasured) continue;
+    ++n;
+    sum += fit.cylinder.radius() - kRadius;
+  }
+  ASSERT_GE(n, 8);
+  EXPECT_LT(std::abs(sum / n), 0.08 * kRadius);
+}
+
 TEST(CylinderFitter, LeavesInTheSegmentDoNotMoveIt) {
   const TestCone trunk = Upright(4.0, 1.0, 0.12);
   double clean = 0.0, dirty = 0.0;

@@ -21,6 +21,8 @@ struct BranchSeparatorConfig {
 
   double fork_width_ratio = 1.4;      ///< A run wider than this times its trunk is cut. > 1.
   int fork_min_excess_pixels = 3;     ///< And by at least this many pixels. >= 1.
+  double excess_width_ratio = 1.1;    ///< A run wider than this times its neighbours gives up the excess. > 1.
+  int excess_min_pixels = 2;          ///< And at least this many pixels on a side. >= 1.
 
   double max_length_m = 3.0;          ///< Longer segments are cut [m]. > 0.
   double max_bow_m = 0.04;            ///< Sagitta at which a curved segment is cut [m]. > 0.
@@ -39,6 +41,8 @@ struct BranchSeparatorConfig {
     v("max_missing_rows", max_missing_rows);
     v("fork_width_ratio", fork_width_ratio);
     v("fork_min_excess_pixels", fork_min_excess_pixels);
+    v("excess_width_ratio", excess_width_ratio);
+    v("excess_min_pixels", excess_min_pixels);
     v("max_length_m", max_length_m);
     v("max_bow_m", max_bow_m);
     v("min_rows_per_piece", min_rows_per_piece);

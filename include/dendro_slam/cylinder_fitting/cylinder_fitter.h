@@ -20,7 +20,7 @@ struct CylinderFitterConfig {
   double min_visible_arc_deg = 60.0;       ///< Less surface seen: UNRESOLVED [deg]. > 0.
   double max_radius_sigma_ratio = 0.25;    ///< Largest sigma_r / r of a measurement. > 0.
   double max_axis_sigma_deg = 12.0;        ///< Largest sigma of the axis direction [deg]. > 0.
-  double max_residual_sigma_m = 0.035;     ///< More scatter along the beam: not a cylinder [m]. > 0.
+  double max_residual_sigma_m = 0.024;     ///< More scatter along the beam: not a cylinder [m]. > 0.
 
   double range_sigma_m = 0.012;       ///< Expected range noise [m]. > 0.
   double range_sigma_weight = 8.0;    ///< Worth of that expectation, in returns. >= 0.
@@ -36,6 +36,10 @@ struct CylinderFitterConfig {
   double detection_sigma = 0.025;       ///< Of detection_fraction from beam to beam: a silhouette is known to this part of the beam's width. > 0.
   double detection_bias_sigma = 0.010;  ///< Of detection_fraction, common to all edges of a segment. > 0.
   double ring_bias_sigma_m = 0.0;   ///< Offset of a laser's ranges against the others' [m]. >= 0.
+
+  /// Error of the odometry over a revolution [m]: where one begins, the two halves of a branch are seen
+  /// that far apart in time. >= 0.
+  double revolution_sigma_m = 0.007;
 
   template <class Visitor>
   void Visit(Visitor&& v) {
@@ -61,6 +65,7 @@ struct CylinderFitterConfig {
     v("detection_sigma", detection_sigma);
     v("detection_bias_sigma", detection_bias_sigma);
     v("ring_bias_sigma_m", ring_bias_sigma_m);
+    v("revolution_sigma_m", revolution_sigma_m);
   }
 
   /// @throws std::invalid_argument naming the field that is out of its range.
