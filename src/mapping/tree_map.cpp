@@ -142,10 +142,12 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
   constexpr double kMaxOffsetRadii = 0.8;
   constexpr double kMinRest = 0.25;  // A piece of which less is left lies within the other one.
   constexpr double kMinRestM = 0.1;
-  // The same wood measured twice has one radius: a piece that stays in another's wood with a radius that
-  // differs by more than this, along this share of the shorter one, is no wood.
+  // The same wood measured twice has one radius: a piece that stays in another's wood along this share of
+  // the shorter one is no wood of its own if its radius differs by more than this, or if it was seen by
+  // so much fewer scans.
   constexpr double kSameWoodRatio = 1.4;
   constexpr double kSameWoodShare = 0.4;
+  constexpr int kFewerScans = 5;
   std::vector<bool> dropped(landmarks.size(), false);
   const auto length = [](const Landmark& l) { return l.s_max_m - l.s_min_m; };
   // Extent of b along a's axis.
@@ -182,10 +184,17 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
       const double ra = a.RadiusAt(middle), rb = b.RadiusAt(s_b);
       const bool a_thin = ra < rb;
-      if (std::max(ra, rb) > kSameWoodRatio * std::min(ra, rb) &&
-          std::abs(ra - rb) > 2.0 * std::hypot(a.RadiusSigmaAt(middle), b.RadiusSigmaAt(s_b)) &&
+      const bool differ =
+          std::max(ra, rb) > kSameWoodRatio * std::min(ra, rb) &&
+          std::abs(ra - rb) > 2.0 * std::hypot(a.RadiusSigmaAt(middle), b.RadiusSigmaAt(s_b));
+      const bool hardly_seen =
+          kFewerScans * std::min(a.num_scans, b.num_scans) < std::max(a.num_scans, b.num_scans);
+      if ((differ || hardly_seen) &&
           end - begin > kSameWoodShare * std::min(length(a), length(b)) &&
-          stays_inside(a_thin ? a : b, a_thin ? b : a, std::max(ra, rb))) {
+          (hardly_seen ? stays_inside(a.num_scans < b.num_scans ? a : b,
+                                      a.num_scans < b.num_scans ? b : a,
+                                      std::max(ra, rb))
+                       : stays_inside(a_thin ? a : b, a_thin ? b : a, std::max(ra, rb)))) {
         dropped[a.num_scans < b.num_scans ? i : j] = true;
         continue;
       }

@@ -267,6 +267,9 @@ TEST(SeparatePieces, DropsAThinPieceInsideAThickOneAndKeepsABranchThatLeavesIt) 
   EXPECT_EQ(inside[0].id, 0);
   EXPECT_NEAR(inside[0].s_max_m, 1.0, 1e-12);  // Nor is the stem cut by it.
   EXPECT_EQ(SeparatePieces({stem, piece(1, {0.05, 0, 1.4}, {0.35, 0, 2.6}, 0.06, 60)}).size(), 2u);
+  // Nearly as thick, but hardly ever seen: it does not cut the stem either. Seen often, it goes on with it.
+  EXPECT_EQ(SeparatePieces({stem, piece(1, {-0.07, -0.05, 1}, {-0.06, 0.02, 2.5}, 0.15, 18)}).size(), 1u);
+  EXPECT_EQ(SeparatePieces({stem, piece(1, {0, 0, 1.4}, {0, 0, 2.6}, 0.17, 100)}).size(), 2u);
 }
 
 TEST(LevelFactors, JacobiansMatchCentralDifferences) {
