@@ -328,10 +328,10 @@ void AppendLabels(const dendro::TreeModel& model,
     const std::optional<double> height = heights.Take(label.anchor.z() + style.label_height_m);
     if (!height) continue;
     // Beyond the wood by half its own width: its letters stand before the background, not on wood.
-    const double clear =
-        (kOutward + kHalfLetter * static_cast<double>(label.text.size())) * style.label_height_m;
+    const double half_width =
+        kHalfLetter * static_cast<double>(label.text.size()) * style.label_height_m;
     Eigen::Vector3d at = label.anchor;
-    at.head<2>() += clear * label.outward;
+    at.head<2>() += (kOutward * style.label_height_m + half_width) * label.outward;
     at.z() = *height;
     visualization_msgs::Marker text = MakeMarker(model.stamp_ns,
                                                  frame_id,
@@ -343,6 +343,8 @@ void AppendLabels(const dendro::TreeModel& model,
     text.text = label.text;
     markers->markers.push_back(text);
     leaders.points.push_back(ToPoint(label.anchor));
+    // Up to the letters, not through them.
+    at.head<2>() -= half_width * label.outward;
     leaders.points.push_back(ToPoint(at));
   }
   if (!leaders.points.empty()) markers->markers.push_back(std::move(leaders));

@@ -28,6 +28,7 @@ constexpr double kStraightOnDeg = 14.0;
 constexpr double kMaxForkBendDeg = 60.0;
 constexpr double kForkOpeningDeg = 25.0;
 constexpr double kForkRadiusRatio = 1.6;
+constexpr double kElbowForkRadiusRatio = 2.5;
 // What leaves a branch within this many of its radii from its beginning, or before it, is its sibling,
 // unless that costs this much more.
 constexpr double kSiblingRadii = 1.5;
@@ -238,6 +239,7 @@ std::vector<Piece> MakePieces(const std::vector<Landmark>& landmarks) {
 struct Joint {
   double cost;
   int piece_a, end_a, piece_b, end_b;
+  bool elbow = false;
   bool operator<(const Joint& o) const {
     return std::tie(cost, piece_a, end_a, piece_b, end_b) <
            std::tie(o.cost, o.piece_a, o.end_a, o.piece_b, o.end_b);
@@ -322,7 +324,7 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
           if (!elbow && ratio > config.join_radius_ratio && std::abs(ra - rb) > 2.0 * radius_sigma) continue;
           const double bend = std::acos(std::clamp(cosine, -1.0, 1.0));
           const double cost = std::abs(along) + 2.0 * sideways + 0.5 * bend + 0.5 * std::log(ratio);
-          const Joint joint{cost, i, e, j, f};
+          const Joint joint{cost, i, e, j, f, elbow};
           if (!GapIsBlocked(pieces, joint)) joints.push_back(joint);
         }
       }
@@ -386,7 +388,13 @@ Vector3d Emergence(const Piece& stem, int end, const Piece& arm, int f) {
 // True when a branch ends here in a fork: two or more arms of similar thickness begin close to this
 // end, lead away from each other, and none of them goes straight on. Then the arms are branches of
 // their own; if one goes on straight, it is the same branch and the others leave it.
-bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const TopologyConfig& config) {
+// Where the branch would have to bend like an elbow to go on, thinner arms count too, and one that goes
+// straight on does not make it one.
+bool IsFork(const std::vector<Piece>& pieces,
+            int piece,
+            int end,
+            bool elbow,
+            const TopologyConfig& config) {
   const Piece& stem = pieces[piece];
   const Vector3d direction = stem.Outward(end);
   struct Arm {
@@ -415,14 +423,14 @@ bool IsFork(const std::vector<Piece>& pieces, int piece, int end, const Topology
     return IsElbow(pieces[a.piece], 1 - a.end, pieces[b.piece], b.end, config);
   };
   for (const Arm& a : arms) {
-    if (a.bend < kStraightOnDeg * kDeg) return false;
+    if (!elbow && a.bend < kStraightOnDeg * kDeg) return false;
   }
   for (std::size_t i = 0; i < arms.size(); ++i) {
     for (std::size_t k = i + 1; k < arms.size(); ++k) {
       const double ratio =
           std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
       if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) &&
-          ratio < kForkRadiusRatio && !goes_on(arms[i], arms[k]) && !goes_on(arms[k], arms[i])) {
+          ratio < (elbow ? kElbowForkRadiusRatio : kForkRadiusRatio) && !goes_on(arms[i], arms[k]) && !goes_on(arms[k], arms[i])) {
         return true;
       }
     }
@@ -440,14 +448,17 @@ std::vector<Chain> MakeChains(const std::vector<Piece>& pieces, const TopologyCo
     while (group[i] != i) i = group[i] = group[group[i]];
     return i;
   };
-  std::map<std::pair<int, int>, bool> fork;
-  const auto is_fork = [&](int piece, int end) {
-    const auto [it, is_new] = fork.emplace(std::make_pair(piece, end), false);
-    if (is_new) it->second = IsFork(pieces, piece, end, config);
+  std::map<std::tuple<int, int, bool>, bool> fork;
+  const auto is_fork = [&](int piece, int end, bool elbow) {
+    const auto [it, is_new] = fork.emplace(std::make_tuple(piece, end, elbow), false);
+    if (is_new) it->second = IsFork(pieces, piece, end, elbow, config);
     return it->second;
   };
   for (const Joint& joint : FindJoints(pieces, config)) {
-    if (is_fork(joint.piece_a, joint.end_a) || is_fork(joint.piece_b, joint.end_b)) continue;
+    if (is_fork(joint.piece_a, joint.end_a, joint.elbow) ||
+        is_fork(joint.piece_b, joint.end_b, joint.elbow)) {
+      continue;
+    }
     auto& a = next[joint.piece_a][joint.end_a];
     auto& b = next[joint.piece_b][joint.end_b];
     if (a.first >= 0 || b.first >= 0) continue;
