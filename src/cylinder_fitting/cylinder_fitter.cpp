@@ -682,6 +682,15 @@ void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
     out->covariance.diagonal().segment<2>(2).array() += half * half;
     out->covariance(4, 4) += half * half * std::pow(cone.radius, -4.0);
   }
+  // What the returns say of the bend, the prior taken out.
+  const Eigen::Matrix2d bend_precision =
+      estimate.covariance.block<2, 2>(kBend, kBend).inverse();
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> bend(
+      bend_precision - Eigen::Matrix2d::Identity() /
+                           (config_.bend_sigma_per_m * config_.bend_sigma_per_m));
+  out->bend_information = bend.eigenvectors() * bend.eigenvalues().cwiseMax(0.0).asDiagonal() *
+                          bend.eigenvectors().transpose();
+  out->bend_vector = bend_precision * PerpendicularBasis(cone.axis).transpose() * bent.bend;
   out->taper_m_per_m = cone.slope;
   out->taper_sigma_m_per_m = std::sqrt(estimate.covariance(kSlope, kSlope));
   out->taper_estimated = out->taper_sigma_m_per_m < 0.5 * config_.taper_sigma_m_per_m;

@@ -67,6 +67,15 @@ Matrix5d CylinderSlideJacobian(const Cylinder& cylinder, double s) {
   return J;
 }
 
+Matrix5d CylinderTurnJacobian(const Eigen::Vector3d& from_axis, const Eigen::Vector3d& to_axis) {
+  const Eigen::Matrix2d M =
+      PerpendicularBasis(to_axis).transpose() * PerpendicularBasis(from_axis);
+  Matrix5d J = Matrix5d::Identity();
+  J.topLeftCorner<2, 2>() = M;
+  J.block<2, 2>(2, 2) = M;
+  return J;
+}
+
 Eigen::Vector3d DisplayAxis(const Eigen::Vector3d& axis) {
   constexpr double kInPlane = 1e-9;
   if (std::abs(axis.z()) > kInPlane) return axis.z() < 0.0 ? Eigen::Vector3d(-axis) : axis;

@@ -153,6 +153,7 @@ Json LandmarkJson(const Landmark& landmark) {
         {{"s_m", finite(knot.s_m, "the radius profile of landmark")},
          {"radius_m", finite(knot.radius_m, "the radius profile of landmark")},
          {"radius_sigma_m", finite(knot.radius_sigma_m, "the radius profile of landmark")},
+         {"offset_m", VecJson(knot.offset_m, "the radius profile of landmark", landmark.id)},
          {"num_scans", knot.num_scans}});
   }
   j["num_scans"] = landmark.num_scans;
@@ -182,6 +183,16 @@ Json LandmarkStateJson(const LandmarkState& state) {
     }
     j["knots"].push_back(
         {{"index", knot.index}, {"num_scans", knot.num_scans}, {"bins", std::move(bins)}});
+  }
+  j["bend_knots"] = Json::array();
+  for (const BendProfile::Knot& knot : state.bend.knots()) {
+    const Eigen::Matrix3d& J = knot.information;
+    j["bend_knots"].push_back(
+        {{"index", knot.index},
+         {"information_upper",
+          {finite(J(0, 0)), finite(J(0, 1)), finite(J(0, 2)), finite(J(1, 1)), finite(J(1, 2)),
+           finite(J(2, 2))}},
+         {"vector", VecJson(knot.vector, what, state.id)}});
   }
   j["first_cell"] = state.first_cell;
   j["coverage"] = state.coverage;
@@ -477,6 +488,30 @@ std::bitset<Landmark::kArcBins> ReadArc(const Reader& j) {
   return std::bitset<Landmark::kArcBins>(arc);
 }
 
+std::vector<BendProfile::Knot> ReadBendKnots(const Reader& list) {
+  std::vector<BendProfile::Knot> knots;
+  const std::size_t count = list.ArraySize();
+  for (std::size_t i = 0; i < count; ++i) {
+    const Reader entry = list.At(i);
+    BendProfile::Knot knot;
+    knot.index = entry["index"].Int();
+    if (!knots.empty() && knot.index <= knots.back().index) {
+      entry["index"].Fail("is not in ascending order");
+    }
+    const Reader upper = entry["information_upper"];
+    upper.RequireSize(6);
+    std::size_t k = 0;
+    for (int row = 0; row < 3; ++row) {
+      for (int col = row; col < 3; ++col) {
+        knot.information(row, col) = knot.information(col, row) = upper.At(k++).Double();
+      }
+    }
+    knot.vector = entry["vector"].Vector();
+    knots.push_back(knot);
+  }
+  return knots;
+}
+
 LandmarkState ReadLandmarkState(const Reader& j) {
   LandmarkState state;
   state.id = j["id"].NonNegative();
@@ -512,6 +547,7 @@ LandmarkState ReadLandmarkState(const Reader& j) {
     knots.push_back(std::move(knot));
   }
   state.profile.set_knots(std::move(knots));
+  if (j.Has("bend_knots")) state.bend.set_knots(ReadBendKnots(j["bend_knots"]));
   state.first_cell = j["first_cell"].Int();
   state.coverage = j["coverage"].Ints();
   state.end_sigma_m = j["end_sigma_m"].Double();
@@ -543,6 +579,7 @@ Landmark ReadLandmark(const Reader& j) {
     knot.radius_m = profile.At(i)["radius_m"].Double();
     knot.radius_sigma_m = profile.At(i)["radius_sigma_m"].Double();
     knot.num_scans = profile.At(i)["num_scans"].Int();
+    if (profile.At(i).Has("offset_m")) knot.offset_m = profile.At(i)["offset_m"].Vector();
     if (!landmark.profile.empty() && knot.s_m < landmark.profile.back().s_m) {
       profile.At(i)["s_m"].Fail("is not in ascending order");
     }
@@ -978,6 +1015,7 @@ std::string TreeMapJson(const MapFiles& files) {
   for (const Landmark& landmark : files.landmarks) j["landmarks"].push_back(LandmarkJson(landmark));
   j["topology"] = TopologyJson(files.topology);
   j["upright"] = files.snapshot.upright;
+  if (files.snapshot.ground) j["ground"] = VecJson(*files.snapshot.ground, "the ground", 0);
   j["next_landmark_state_id"] = files.snapshot.next_landmark_id;
   j["landmark_states"] = Json::array();
   for (const LandmarkState& state : files.snapshot.landmarks) {
@@ -1082,6 +1120,7 @@ MapFiles LoadMap(const std::string& directory) {
   }
   files.topology = ReadTopology(j["topology"]);
   files.snapshot.upright = j["upright"].Bool();
+  if (j.Has("ground")) files.snapshot.ground = j["ground"].Vector();
   files.snapshot.next_landmark_id = j["next_landmark_state_id"].NonNegative();
   read_list("landmark_states", ReadLandmarkState, &files.snapshot.landmarks);
   // Last, so that a field that is wrong is named; absent from maps of before.

@@ -77,8 +77,11 @@ LineResidual ComputeLineResidual(const FittedCylinder& observation,
   const Cylinder measured = observation.cylinder.Slid(s_observation);
   const Matrix5d J_slide = CylinderSlideJacobian(observation.cylinder, s_observation);
   const Matrix5d C = J_slide * observation.covariance * J_slide.transpose();
-  const Cylinder line = landmark.cylinder.Slid(s_landmark);
-  const Matrix5d J_line = CylinderSlideJacobian(landmark.cylinder, s_landmark);
+  // Where the landmark is bent, the straight line nearest to it over the same stretch.
+  Cylinder line = landmark.LineOver(std::min(a, b), std::max(a, b));
+  line = line.Slid(s_landmark - 0.5 * (a + b));
+  const Matrix5d J_line = CylinderTurnJacobian(landmark.cylinder.axis, line.axis) *
+                          CylinderSlideJacobian(landmark.cylinder, s_landmark);
   const Matrix5d L = J_line * landmark.covariance * J_line.transpose();
 
   Eigen::Matrix<double, 5, 6> J_pose;

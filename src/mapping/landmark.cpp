@@ -1,5 +1,8 @@
 #include "dendro_slam/mapping/landmark.h"
 
+#include <algorithm>
+#include <utility>
+
 namespace dendro {
 
 namespace {
@@ -17,12 +20,66 @@ double Interpolate(const std::vector<RadiusKnot>& profile, double s, double Radi
   return profile.back().*field;
 }
 
+// The offset at s and its slope: linear between the knots, the outer stretches go on beyond them.
+std::pair<Eigen::Vector3d, Eigen::Vector3d> Offset(const std::vector<RadiusKnot>& profile, double s) {
+  if (profile.size() < 2) {
+    return {profile.empty() ? Eigen::Vector3d::Zero() : profile.front().offset_m,
+            Eigen::Vector3d::Zero()};
+  }
+  std::size_t i = 1;
+  while (i + 1 < profile.size() && s > profile[i].s_m) ++i;
+  const RadiusKnot& a = profile[i - 1];
+  const RadiusKnot& b = profile[i];
+  const double span = b.s_m - a.s_m;
+  if (!(span > 1e-6)) return {b.offset_m, Eigen::Vector3d::Zero()};
+  const Eigen::Vector3d slope = (b.offset_m - a.offset_m) / span;
+  return {a.offset_m + (s - a.s_m) * slope, slope};
+}
+
 }  // namespace
 
 double Landmark::RadiusAt(double s_m) const { return Interpolate(profile, s_m, &RadiusKnot::radius_m); }
 
 double Landmark::RadiusSigmaAt(double s_m) const {
   return Interpolate(profile, s_m, &RadiusKnot::radius_sigma_m);
+}
+
+Eigen::Vector3d Landmark::PointAt(double s_m) const {
+  return cylinder.point + s_m * cylinder.axis + Offset(profile, s_m).first;
+}
+
+Eigen::Vector3d Landmark::AxisAt(double s_m) const {
+  return (cylinder.axis + Offset(profile, s_m).second).normalized();
+}
+
+Cylinder Landmark::LineOver(double s_begin_m, double s_end_m) const {
+  const double middle = 0.5 * (s_begin_m + s_end_m), length = s_end_m - s_begin_m;
+  Cylinder line = cylinder.Slid(middle);
+  const bool straight = std::all_of(
+      profile.begin(), profile.end(), [](const RadiusKnot& k) { return k.offset_m.isZero(0.0); });
+  if (straight) return line;
+  constexpr int kSamples = 8;
+  Eigen::Vector3d mean = Eigen::Vector3d::Zero(), slope = Eigen::Vector3d::Zero();
+  double weight = 0.0;
+  for (int i = 0; i < kSamples; ++i) {
+    const double t = (i + 0.5) / kSamples - 0.5;
+    const Eigen::Vector3d offset = Offset(profile, middle + t * length).first;
+    mean += offset / kSamples;
+    slope += t * offset;
+    weight += t * t;
+  }
+  line.point += mean;
+  if (length > 1e-6) line.axis = (line.axis + slope / (weight * length)).normalized();
+  return line;
+}
+
+Landmark TransformLandmark(const Eigen::Isometry3d& T_a_b, const Landmark& landmark_b) {
+  Landmark out = landmark_b;
+  const Matrix5d J = CylinderTangentTransform(T_a_b, landmark_b.cylinder);
+  out.covariance = J * landmark_b.covariance * J.transpose();
+  out.cylinder = TransformCylinder(T_a_b, landmark_b.cylinder);
+  for (RadiusKnot& knot : out.profile) knot.offset_m = T_a_b.linear() * knot.offset_m;
+  return out;
 }
 
 }  // namespace dendro

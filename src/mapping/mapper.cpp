@@ -82,6 +82,33 @@ FittedCylinder ConditionOnRadius(const FittedCylinder& fit, double radius, doubl
   return out;
 }
 
+// Share of the beams of a scan that should have met the surface that a fit saw which returned from
+// it: 1 for a trunk or branch, less for a cylinder laid around several twigs. The lidar spins about z.
+double Fill(const FittedCylinder& fit, double column_step_rad) {
+  const Eigen::Vector3d level = Eigen::Vector3d::UnitZ().cross(fit.cylinder.point).normalized();
+  // A ring cuts a slanting branch along more columns than its width, a level one has no width.
+  const double steep =
+      std::sqrt(std::max(0.04, 1.0 - std::pow(fit.cylinder.axis.dot(level), 2)));
+  const double half_arc = 0.5 * std::clamp(fit.visible_arc_rad, 0.3, M_PI);
+  const double width = 2.0 * fit.cylinder.radius() * std::sin(half_arc) / steep;
+  const double beams = fit.num_rings * width / (std::max(fit.distance_m, 0.1) * column_step_rad);
+  return fit.num_points / std::max(beams, 1e-9);
+}
+
+// Takes an offset and a slope [map frame] off a measured line.
+FittedCylinder Straightened(const FittedCylinder& fit,
+                            const Eigen::Isometry3d& T_map_lidar,
+                            const Eigen::Vector3d& offset,
+                            const Eigen::Vector3d& slope) {
+  FittedCylinder out = fit;
+  out.cylinder.point -= T_map_lidar.linear().transpose() * offset;
+  out.cylinder.axis =
+      (fit.cylinder.axis - T_map_lidar.linear().transpose() * slope).normalized();
+  const Matrix5d turn = CylinderTurnJacobian(fit.cylinder.axis, out.cylinder.axis);
+  out.covariance = turn * fit.covariance * turn.transpose();
+  return out;
+}
+
 }  // namespace
 
 void MapperConfig::Validate() const {
@@ -112,6 +139,8 @@ void MapperConfig::Validate() const {
   Require(observation_axis_floor_deg >= 0.0, "observation_axis_floor_deg must be >= 0");
   Require(observation_offset_floor_m >= 0.0, "observation_offset_floor_m must be >= 0");
   Require(robust_width > 0.0, "robust_width must be > 0");
+  Require(min_fill >= 0.0 && min_fill < 1.0, "min_fill must be in [0, 1)");
+  Require(column_step_deg > 0.0, "column_step_deg must be > 0");
   Require(nearby_radius_m > 0.0, "nearby_radius_m must be > 0");
   Require(nearby_max >= 1, "nearby_max must be >= 1");
   Require(min_radius_m > 0.0, "min_radius_m must be > 0");
@@ -239,7 +268,10 @@ class Mapper::Impl {
                                                Key to) const;
   int FindRedundantKeyFrame();
   void MaintainMap();
-  void MoveFactors(const std::vector<FactorId>& factors, Key to, const Cylinder* initial);
+  void MoveFactors(const std::vector<FactorId>& factors,
+                   Key to,
+                   const Cylinder* initial,
+                   const LandmarkState* from);
   void UpdateWaiting();
   void RefreshLines();
   void RefreshNearby(int id);
@@ -254,6 +286,7 @@ std::vector<FittedCylinder> Mapper::Impl::Usable(
     if (!c.cylinder.axis.allFinite() || !c.cylinder.point.allFinite() ||
         !std::isfinite(c.cylinder.curvature) || !(c.cylinder.curvature > 0.0) ||
         !std::isfinite(c.start_s_m) || !std::isfinite(c.end_s_m) || c.end_s_m <= c.start_s_m ||
+        !c.bend_information.allFinite() || !c.bend_vector.allFinite() ||
         !std::isfinite(c.taper_m_per_m) || !std::isfinite(c.taper_sigma_m_per_m) ||
         std::abs(c.cylinder.axis.norm() - 1.0) > 1e-3) {
       continue;
@@ -262,6 +295,7 @@ std::vector<FittedCylinder> Mapper::Impl::Usable(
     if (radius < config.min_radius_m) continue;
     if (!IsPositiveDefinite(c.covariance)) continue;
     if (c.radius_sigma_m() > config.max_radius_sigma_rel * radius) continue;
+    if (Fill(c, config.column_step_deg * kRadPerDeg) < config.min_fill) continue;
     FittedCylinder scaled = c;
     scaled.cylinder.axis.normalize();
     scaled.covariance *= config.observation_scale * config.observation_scale;
@@ -423,6 +457,20 @@ FactorPtr Mapper::Impl::ObservationFactor(int key_frame,
   const Landmark summary = map.Summary(id);
   const LandmarkState& state = map.State(id);
   FittedCylinder conditioned = Conditioned(fit, summary, T_map_lidar);
+  // The fit is a straight line beside a bent axis, the variable touches that axis at its anchor.
+  const BentAxis bent = map.Bent(state);
+  if (!bent.straight()) {
+    const Eigen::Vector3d anchor = T_map_lidar * fit.cylinder.point;
+    const Eigen::Vector3d axis = T_map_lidar.linear() * fit.cylinder.axis;
+    const double sign = axis.dot(state.line.axis) < 0.0 ? -1.0 : 1.0;
+    const double s = (anchor - state.line.point).dot(state.line.axis);
+    const double a = s + sign * fit.start_s_m, b = s + sign * fit.end_s_m;
+    const AxisOffset chord = bent.Chord(std::min(a, b), std::max(a, b));
+    conditioned = Straightened(conditioned,
+                               T_map_lidar,
+                               chord.offset + (s - 0.5 * (a + b)) * chord.slope,
+                               sign * chord.slope);
+  }
   // The variable's curvature is that at its own anchor: bring the measured one there along the
   // profile, so that a taper does not pull.
   const double s_variable = (state.line.point - summary.cylinder.point).dot(summary.cylinder.axis);
@@ -665,8 +713,12 @@ void Mapper::Impl::MaintainMap() {
     const std::optional<LandmarkMerge> merge = map.FindDuplicate(config.association);
     if (!merge) break;
     wait_for(LandmarkKey(merge->keep_id), LandmarkKey(merge->drop_id));
-    MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)), LandmarkKey(merge->keep_id), nullptr);
+    const LandmarkState dropped = map.State(merge->drop_id);
     map.Merge(*merge);
+    MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)),
+                LandmarkKey(merge->keep_id),
+                nullptr,
+                &dropped);
     marginals.erase(merge->drop_id);
   }
   for (int i = 0; i < 3; ++i) {
@@ -690,7 +742,7 @@ void Mapper::Impl::MaintainMap() {
       if ((s > middle) == piece.second) moved.push_back(factor);
     }
     if (!moved.empty()) {
-      MoveFactors(moved, LandmarkKey(piece.first), &line);
+      MoveFactors(moved, LandmarkKey(piece.first), &line, nullptr);
     } else {
       // Nothing of this session fell on it: what an earlier one knew holds for both pieces.
       waiting.values.Insert(LandmarkKey(piece.first), Value(line));
@@ -705,16 +757,53 @@ void Mapper::Impl::MaintainMap() {
 }
 
 // Hangs observations of one landmark on another one, which `initial` creates, with the next update.
+// `from`, unless both have one line, is the landmark that they were straightened for.
 void Mapper::Impl::MoveFactors(const std::vector<FactorId>& factors,
                                Key to,
-                               const Cylinder* initial) {
+                               const Cylinder* initial,
+                               const LandmarkState* from) {
+  BentAxis old_axis, new_axis;
+  const LandmarkState* keep = nullptr;
+  if (from != nullptr) {
+    keep = &map.State(static_cast<int>(KeyIndex(to)));
+    old_axis = map.Bent(*from);
+    new_axis = map.Bent(*keep);
+  }
+  const auto straighten = [&](const Cylinder& measured,
+                              const Matrix5d& covariance,
+                              const Eigen::Isometry3d& T_map_lidar) {
+    FittedCylinder fit;
+    fit.cylinder = measured;
+    fit.covariance = covariance;
+    if (keep == nullptr || (old_axis.straight() && new_axis.straight())) return fit;
+    const Eigen::Vector3d p = T_map_lidar * measured.point;
+    const Eigen::Vector3d a = T_map_lidar.linear() * measured.axis;
+    const AxisOffset before = old_axis.At((p - from->line.point).dot(from->line.axis));
+    const AxisOffset after = new_axis.At((p - keep->line.point).dot(keep->line.axis));
+    const double sign_before = a.dot(from->line.axis) < 0.0 ? -1.0 : 1.0;
+    const double sign_after = a.dot(keep->line.axis) < 0.0 ? -1.0 : 1.0;
+    return Straightened(fit,
+                        T_map_lidar,
+                        after.offset - before.offset,
+                        sign_after * after.slope - sign_before * before.slope);
+  };
   for (FactorId id : factors) {
     const FactorPtr& factor = solver.GetFactor(id);
     if (const auto* o = dynamic_cast<const CylinderFactor*>(factor.get())) {
-      waiting.factors.push_back(std::make_shared<CylinderFactor>(
-          o->keys()[0], to, o->measured(), o->covariance(), o->parts(), o->noise().kernel()));
+      const FittedCylinder fit =
+          straighten(o->measured(),
+                     o->covariance(),
+                     solver.Estimate<Eigen::Isometry3d>(o->keys()[0]));
+      waiting.factors.push_back(std::make_shared<CylinderFactor>(o->keys()[0],
+                                                           to,
+                                                           fit.cylinder,
+                                                           fit.covariance,
+                                                           o->parts(),
+                                                           o->noise().kernel()));
     } else if (const auto* prior = dynamic_cast<const CylinderPrior*>(factor.get())) {
-      waiting.factors.push_back(std::make_shared<CylinderPrior>(to, prior->mean(), prior->noise()));
+      const FittedCylinder mean =
+          straighten(prior->mean(), Matrix5d::Identity(), Eigen::Isometry3d::Identity());
+      waiting.factors.push_back(std::make_shared<CylinderPrior>(to, mean.cylinder, prior->noise()));
     }
     waiting.options.remove_factors.push_back(id);
   }
@@ -775,11 +864,7 @@ void Mapper::Impl::RefreshLines() {
 void Mapper::Impl::RefreshNearby(int id) {
   for (Landmark& l : nearby) {
     if (l.id != id) continue;
-    l = map.Summary(id);
-    const Eigen::Isometry3d T_kf_map = T_map_kf.inverse();
-    const Matrix5d R = CylinderTangentTransform(T_kf_map, l.cylinder);
-    l.covariance = R * l.covariance * R.transpose();
-    l.cylinder = TransformCylinder(T_kf_map, l.cylinder);
+    l = TransformLandmark(T_map_kf.inverse(), map.Summary(id));
   }
 }
 
@@ -977,6 +1062,15 @@ void Mapper::Impl::StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3
     marginals[state.id] = state.covariance;
     scan_number = std::max(scan_number, state.last_scan);
   }
+  if (snapshot.ground) {
+    const PointN plane = *snapshot.ground;
+    values.Insert(kGroundKey, Value(plane));
+    Eigen::Vector3d sigmas(config.ground_sigma_m,
+                           config.ground_sigma_deg * kRadPerDeg,
+                           config.ground_sigma_deg * kRadPerDeg);
+    factors.push_back(
+        std::make_shared<VectorPrior>(kGroundKey, plane, NoiseModel::Sigmas(sigmas)));
+  }
   if (!factors.empty()) solver.Update(factors, values);
   start_pose = T_map_lidar;
   upright = snapshot.upright;
@@ -1006,7 +1100,10 @@ MapperResult Mapper::Impl::AddScanWhileLost(const MapperInput& input) {
   search.radius_ratio = config.relocalize_radius_ratio;
   search.min_matches = config.relocalize_min_matches;
   search.tilt_deg = config.relocalize_tilt_deg;
-  search.upright = pending->upright && local->Snapshot().upright;
+  const MapSnapshot seen = local->Snapshot();
+  search.upright = pending->upright && seen.upright;
+  search.local_ground = seen.ground;
+  search.loaded_ground = pending->ground;
   TreeMap loaded(config.tree_map, config.radius_profile);
   loaded.Restore(pending->landmarks, pending->next_landmark_id);
   const std::optional<Relocalization> found =
@@ -1093,10 +1190,17 @@ bool Mapper::relocalizing() const { return impl_->pending.has_value(); }
 
 MapSnapshot Mapper::Snapshot() const {
   if (impl_->pending) return *impl_->pending;
-  return {impl_->map.next_id(), impl_->upright, impl_->StatesWithMarginals(false)};
+  MapSnapshot snapshot{impl_->map.next_id(), impl_->upright, {}, impl_->StatesWithMarginals(false)};
+  if (impl_->solver.Contains(kGroundKey)) {
+    snapshot.ground = impl_->solver.Estimate<PointN>(kGroundKey);
+  }
+  return snapshot;
 }
 
 void Mapper::Load(const MapSnapshot& snapshot) {
+  if (snapshot.ground && !snapshot.ground->allFinite()) {
+    throw std::invalid_argument("MapSnapshot: the ground is not finite");
+  }
   int previous = -1;
   for (const LandmarkState& state : snapshot.landmarks) {
     const std::string name = "MapSnapshot: landmark " + std::to_string(state.id);

@@ -148,6 +148,11 @@ Eigen::Isometry3d Refine(const std::vector<Landmark>& local,
   return T;
 }
 
+// Height of a point above a plane given as z over x and y.
+double Above(const Eigen::Vector3d& ground, const Eigen::Vector3d& p) {
+  return p.z() - (ground[0] + ground[1] * p.x() + ground[2] * p.y());
+}
+
 }  // namespace
 
 std::optional<Relocalization> Relocalize(const std::vector<Landmark>& local,
@@ -176,6 +181,19 @@ std::optional<Relocalization> Relocalize(const std::vector<Landmark>& local,
       b_high = std::max(b_high, k.radius_m);
     }
     return a_low < b_high * config.radius_ratio && b_low < a_high * config.radius_ratio;
+  };
+  const bool ground_known = config.local_ground && config.loaded_ground;
+  const bool two_are_enough =
+      config.two_matches_margin > 0.0 && config.upright && ground_known;
+  const int needed = two_are_enough ? std::min(2, config.min_matches) : config.min_matches;
+  const auto ground_agrees = [&](const Eigen::Isometry3d& T, const Verified& verified) {
+    if (!ground_known) return true;
+    for (const auto& [a, b] : verified.matches) {
+      const Eigen::Vector3d& p = local[static_cast<std::size_t>(a)].cylinder.point;
+      const double difference = Above(*config.local_ground, p) - Above(*config.loaded_ground, T * p);
+      if (std::abs(difference) > config.ground_m) return false;
+    }
+    return true;
   };
   // Angles and closest points of the loaded pairs, once.
   struct LoadedPair {
@@ -226,10 +244,11 @@ std::optional<Relocalization> Relocalize(const std::vector<Landmark>& local,
             loose.axis_deg *= 1.5;
             loose.offset_m *= 1.5;
             Verified verified = Verify(local, loaded, T, loose);
-            if (static_cast<int>(verified.matches.size()) < config.min_matches) continue;
+            if (static_cast<int>(verified.matches.size()) < needed) continue;
             T = Refine(local, loaded, verified.matches, T, loose);
             verified = Verify(local, loaded, T, config);
-            if (static_cast<int>(verified.matches.size()) < config.min_matches) continue;
+            if (static_cast<int>(verified.matches.size()) < needed) continue;
+            if (!ground_agrees(T, verified)) continue;
             bool known = false;
             for (Found& f : found) {
               if (distinct(f.T, T)) continue;
@@ -258,6 +277,18 @@ std::optional<Relocalization> Relocalize(const std::vector<Landmark>& local,
   const double share =
       static_cast<double>(best.verified.matches.size()) / static_cast<double>(local.size());
   if (share < config.min_share) return std::nullopt;
+  if (static_cast<int>(best.verified.matches.size()) < config.min_matches) {
+    // So few could agree by chance: nothing else may agree, and they must agree well.
+    RelocalizerConfig strict = config;
+    strict.axis_deg /= config.two_matches_margin;
+    strict.offset_m /= config.two_matches_margin;
+    strict.radius_ratio = 1.0 + (config.radius_ratio - 1.0) / config.two_matches_margin;
+    strict.ground_m /= config.two_matches_margin;
+    if (found.size() > 1) return std::nullopt;
+    if (Verify(local, loaded, best.T, strict).matches.size() < best.verified.matches.size()) {
+      return std::nullopt;
+    }
+  }
   if (found.size() > 1 && found[1].verified.matches.size() == best.verified.matches.size() &&
       distinct(best.T, found[1].T)) {
     return std::nullopt;  // two places fit as well

@@ -79,7 +79,15 @@ Landmark Summarize(const LandmarkState& state,
   Landmark out;
   out.id = state.id;
   out.cylinder = state.line.Slid(middle);
-  const Matrix5d J = CylinderSlideJacobian(state.line, middle);
+  Matrix5d J = CylinderSlideJacobian(state.line, middle);
+  const BentAxis bent =
+      state.bend.Solve(state.line.axis, profile_config.knot_spacing_m, config.bend_sigma_per_m);
+  if (!bent.straight()) {
+    const AxisOffset chord = bent.Chord(extent.begin, extent.end);
+    out.cylinder.point += chord.offset;
+    out.cylinder.axis = (out.cylinder.axis + chord.slope).normalized();
+    J = CylinderTurnJacobian(state.line.axis, out.cylinder.axis) * J;
+  }
   out.covariance = J * state.covariance * J.transpose();
   out.s_min_m = extent.begin - middle;
   out.s_max_m = extent.end - middle;
@@ -88,7 +96,14 @@ Landmark Summarize(const LandmarkState& state,
   cropped.Crop(extent.begin, extent.end, profile_config);
   out.profile = cropped.Knots(profile_config);
   if (out.profile.empty()) out.profile = state.profile.Knots(profile_config);
-  for (RadiusKnot& knot : out.profile) knot.s_m -= middle;
+  for (RadiusKnot& knot : out.profile) {
+    if (!bent.straight()) {
+      const Eigen::Vector3d from_anchor = state.line.point + knot.s_m * state.line.axis +
+                                          bent.At(knot.s_m).offset - out.cylinder.point;
+      knot.offset_m = from_anchor - from_anchor.dot(out.cylinder.axis) * out.cylinder.axis;
+    }
+    knot.s_m -= middle;
+  }
   const double radius = out.RadiusAt(0.0);
   out.cylinder.curvature = 1.0 / radius;
   // The radius is the profile's business; the graph's curvature only helps the lines.
@@ -124,6 +139,8 @@ void Clip(double begin, double end, Landmark* landmark) {
     knot.radius_m = landmark->RadiusAt(s);
     knot.radius_sigma_m = landmark->RadiusSigmaAt(s);
     knot.num_scans = landmark->num_scans;
+    knot.offset_m =
+        landmark->PointAt(s) - landmark->cylinder.point - s * landmark->cylinder.axis;
     profile.push_back(knot);
   }
   for (const RadiusKnot& knot : landmark->profile) {
@@ -177,10 +194,10 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const double begin = std::max(a.s_min_m, on_a.first), end = std::min(a.s_max_m, on_a.second);
       if (end <= begin) continue;
       const double middle = 0.5 * (begin + end);
-      const Eigen::Vector3d p = a.cylinder.point + middle * a.cylinder.axis;
-      const Eigen::Vector3d d = p - b.cylinder.point;
-      const double s_b = d.dot(b.cylinder.axis);
-      const double offset = (d - s_b * b.cylinder.axis).norm();
+      const Eigen::Vector3d p = a.PointAt(middle);
+      const double s_b = (p - b.cylinder.point).dot(b.cylinder.axis);
+      const Eigen::Vector3d d = p - b.PointAt(s_b);
+      const double offset = (d - d.dot(b.cylinder.axis) * b.cylinder.axis).norm();
       if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
       const double ra = a.RadiusAt(middle), rb = b.RadiusAt(s_b);
       const bool a_thin = ra < rb;
@@ -235,6 +252,7 @@ void TreeMapConfig::Validate() const {
   Require(confirm_radius_sigma_rel > 0.0, "confirm_radius_sigma_rel must be > 0");
   Require(candidate_max_gap_scans >= 1, "candidate_max_gap_scans must be >= 1");
   Require(max_length_m > 0.0, "max_length_m must be > 0");
+  Require(bend_sigma_per_m > 0.0, "bend_sigma_per_m must be > 0");
   Require(coverage_cell_m > 0.0, "coverage_cell_m must be > 0");
   Require(end_support > 0.0 && end_support <= 1.0, "end_support must be in (0, 1]");
   Require(min_gap_m > 0.0, "min_gap_m must be > 0");
@@ -285,19 +303,28 @@ int TreeMap::Add(const FittedCylinder& observation,
   const Matrix5d J = CylinderTangentTransform(T_map_lidar, observation.cylinder);
   Matrix5d covariance = J * observation.covariance * J.transpose();
   if (axis.dot(state.line.axis) < 0.0) {
-    Matrix5d flip = Matrix5d::Identity();
-    const Eigen::Matrix2d M =
-        PerpendicularBasis(axis).transpose() * PerpendicularBasis(state.line.axis);
-    flip.topLeftCorner<2, 2>() = M;
-    flip.block<2, 2>(2, 2) = M;
+    const Matrix5d flip = CylinderTurnJacobian(state.line.axis, axis);
     covariance = flip * covariance * flip.transpose();
   }
   state.line.axis = axis;
   state.covariance = covariance;
   state.first_scan = scan_number;
   states_.push_back(std::move(state));
-  Observe(states_.back().id, observation, T_map_lidar, scan_number);
-  return states_.back().id;
+  LandmarkState& added = states_.back();
+  Observe(added.id, observation, T_map_lidar, scan_number);
+  // The fit is the straight line nearest to a bent axis; the landmark's touches it at the anchor.
+  const BentAxis bent = Bent(added);
+  if (!bent.straight()) {
+    const double sign =
+        (T_map_lidar.linear() * observation.cylinder.axis).dot(axis) < 0.0 ? -1.0 : 1.0;
+    const double a = sign * observation.start_s_m, b = sign * observation.end_s_m;
+    const AxisOffset chord = bent.Chord(std::min(a, b), std::max(a, b));
+    added.line.point -= chord.offset - 0.5 * (a + b) * chord.slope;
+    added.line.axis = (axis - chord.slope).normalized();
+    const Matrix5d turn = CylinderTurnJacobian(axis, added.line.axis);
+    added.covariance = turn * added.covariance * turn.transpose();
+  }
+  return added.id;
 }
 
 void TreeMap::Observe(int id,
@@ -330,6 +357,7 @@ void TreeMap::Observe(int id,
   o.view_angle_rad = AngleAround(state->line, T_map_lidar.translation());
   o.distance_m = observation.distance_m;
   state->profile.Add(o, profile_config_);
+  state->bend.Add(observation, T_map_lidar, o.s_start_m, o.s_end_m, profile_config_.knot_spacing_m);
 
   Cover(state, o.s_start_m, o.s_end_m, config_.coverage_cell_m);
   state->end_sigma_m = (state->end_sigma_m * state->num_scans + observation.end_sigma_m) /
@@ -470,6 +498,7 @@ void TreeMap::Merge(const LandmarkMerge& merge) {
   const Eigen::Vector2d turned = PerpendicularBasis(keep->line.axis).transpose() * zero;
   const double turn = std::atan2(turned.y(), turned.x());
   keep->profile.Merge(drop->profile, offset, same_sign, turn, profile_config_);
+  keep->bend.Merge(drop->bend, offset, same_sign, profile_config_.knot_spacing_m);
   const double cell = config_.coverage_cell_m;
   for (std::size_t k = 0; k < drop->coverage.size(); ++k) {
     if (drop->coverage[k] == 0) continue;

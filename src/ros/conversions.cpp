@@ -483,6 +483,10 @@ dendro_slam::ScanCylindersPtr ToMsg(const std::vector<dendro::FittedCylinder>& c
     out.taper = in.taper_m_per_m;
     out.taper_sigma = in.taper_sigma_m_per_m;
     out.taper_estimated = in.taper_estimated;
+    for (int k = 0; k < 4; ++k) {
+      out.bend_information[static_cast<std::size_t>(k)] = in.bend_information(k / 2, k % 2);
+    }
+    for (int k = 0; k < 2; ++k) out.bend_vector[static_cast<std::size_t>(k)] = in.bend_vector[k];
     out.start_s = in.start_s_m;
     out.end_s = in.end_s_m;
     out.end_sigma = in.end_sigma_m;
@@ -580,6 +584,10 @@ std::vector<dendro::FittedCylinder> FromMsg(const dendro_slam::ScanCylinders& cy
     out.taper_m_per_m = in.taper;
     out.taper_sigma_m_per_m = in.taper_sigma;
     out.taper_estimated = in.taper_estimated != 0;
+    for (int k = 0; k < 4; ++k) {
+      out.bend_information(k / 2, k % 2) = in.bend_information[static_cast<std::size_t>(k)];
+    }
+    for (int k = 0; k < 2; ++k) out.bend_vector[k] = in.bend_vector[static_cast<std::size_t>(k)];
     out.start_s_m = in.start_s;
     out.end_s_m = in.end_s;
     out.end_sigma_m = in.end_sigma;

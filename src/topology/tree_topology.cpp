@@ -39,6 +39,13 @@ constexpr double kElbowRadiusRatio = 1.25;
 // sum, fill the same space.
 constexpr double kSameWayDeg = 15.0;
 constexpr double kPenetration = 0.75;
+// Below what was seen of a base, the radius grows as it does over this stretch above, at most by
+// kMaxTaper; kTaperSigma of that is not known.
+constexpr double kTaperStretchM = 0.75;
+constexpr double kMaxTaper = 0.08;
+constexpr double kTaperSigma = 0.02;
+// A bent piece is looked at in straight parts of this length.
+constexpr double kRunM = 0.5;
 
 // -------------------------------------------------------------------------------------------
 // Geometry
@@ -83,14 +90,13 @@ ClosestPoints ClosestOfSegments(const Vector3d& p0,
 // A landmark with its two ends: 0 at s_min, 1 at s_max.
 struct Piece {
   const Landmark* landmark = nullptr;
-  Vector3d end[2];
+  Vector3d end[2], outward[2];
   double radius[2] = {0.0, 0.0};
   double sigma[2] = {0.0, 0.0};
   double length = 0.0;
 
-  Vector3d Outward(int e) const {
-    return e == 1 ? landmark->cylinder.axis : Vector3d(-landmark->cylinder.axis);
-  }
+  // Which way the axis leaves the piece at an end.
+  Vector3d Outward(int e) const { return outward[e]; }
 };
 
 // A piece in a chain; reversed: walked from end 1 to end 0.
@@ -223,7 +229,11 @@ std::vector<Piece> MakePieces(const std::vector<Landmark>& landmarks) {
     piece.landmark = &landmark;
     const double s[2] = {landmark.s_min_m, landmark.s_max_m};
     for (int e = 0; e < 2; ++e) {
-      piece.end[e] = landmark.cylinder.point + s[e] * landmark.cylinder.axis;
+      piece.end[e] = landmark.PointAt(s[e]);
+      // Over a stretch: where exactly a piece ends is not known well.
+      const double back = std::min(kRunM, 0.5 * (s[1] - s[0]));
+      piece.outward[e] = e == 1 ? landmark.LineOver(s[1] - back, s[1]).axis
+                                : Vector3d(-landmark.LineOver(s[0], s[0] + back).axis);
       piece.radius[e] = RadiusAt(landmark, s[e]);
       piece.sigma[e] = SigmaAt(landmark, s[e]);
     }
@@ -295,7 +305,6 @@ std::vector<Joint> FindJoints(const std::vector<Piece>& pieces, const TopologyCo
     for (int j = i + 1; j < n; ++j) {
       const Piece& a = pieces[i];
       const Piece& b = pieces[j];
-      if (std::abs(a.landmark->cylinder.axis.dot(b.landmark->cylinder.axis)) < cos_elbow) continue;
       // No end of one is anywhere near an end of the other.
       const double far = config.join_gap_m + config.join_offset_m + 1.0 + a.length + b.length;
       if ((a.landmark->cylinder.point - b.landmark->cylinder.point).squaredNorm() > 4.0 * far * far)
@@ -351,7 +360,21 @@ void FinishChain(const std::vector<Piece>& pieces, Chain* chain) {
       const Run& last = chain->runs.back();
       chain->runs.push_back({last.p1, piece.end[in], last.r1, piece.radius[in]});
     }
-    chain->runs.push_back({piece.end[in], piece.end[out], piece.radius[in], piece.radius[out]});
+    // A bent piece in several straight ones.
+    const Landmark& landmark = *piece.landmark;
+    const double s[2] = {landmark.s_min_m, landmark.s_max_m};
+    const int parts = std::max(1, static_cast<int>(std::ceil(piece.length / kRunM)));
+    Vector3d from = piece.end[in];
+    double r_from = piece.radius[in];
+    for (int k = 1; k <= parts; ++k) {
+      const double f = static_cast<double>(k) / parts;
+      const double at = (1.0 - f) * s[in] + f * s[out];
+      const Vector3d to = k == parts ? piece.end[out] : landmark.PointAt(at);
+      const double r_to = k == parts ? piece.radius[out] : RadiusAt(landmark, at);
+      chain->runs.push_back({from, to, r_from, r_to});
+      from = to;
+      r_from = r_to;
+    }
     length += piece.length;
     weighted += piece.length * 0.5 * (piece.radius[0] + piece.radius[1]);
   }
@@ -724,8 +747,8 @@ MapCylinder MeasuredSection(const Piece& piece, double s0, double s1, bool rever
   const double middle = 0.5 * (s0 + s1);
   MapCylinder section;
   section.landmark_id = landmark.id;
-  section.start = cylinder.point + (reversed ? s1 : s0) * cylinder.axis;
-  section.end = cylinder.point + (reversed ? s0 : s1) * cylinder.axis;
+  section.start = landmark.PointAt(reversed ? s1 : s0);
+  section.end = landmark.PointAt(reversed ? s0 : s1);
   section.radius_m = RadiusAt(landmark, middle);
   section.radius_sigma_m = SigmaAt(landmark, middle);
   const double rise = RadiusAt(landmark, s1) - RadiusAt(landmark, s0);
@@ -1050,7 +1073,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     const auto at = [&](int k, bool entry) {
       const Landmark& landmark = *pieces[chain.links[k].piece].landmark;
       const double s = stretch[k][entry ? chain.links[k].EntryEnd() : chain.links[k].ExitEnd()];
-      return std::make_tuple(Vector3d(landmark.cylinder.point + s * landmark.cylinder.axis),
+      return std::make_tuple(landmark.PointAt(s),
                              RadiusAt(landmark, s),
                              SigmaAt(landmark, s));
     };
@@ -1059,26 +1082,32 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     // Below the first piece: up to the parent's surface, or down to the ground.
     const Link& first = chain.links.front();
     const Vector3d outward = pieces[first.piece].Outward(first.EntryEnd());
+    // Wood goes on thickening towards its base as it does where it was seen.
+    const auto add_base = [&](double length) {
+      const auto [base, radius, sigma] = at(0, true);
+      const Landmark& landmark = *pieces[first.piece].landmark;
+      const int entry = first.EntryEnd();
+      const double inward = std::min(kTaperStretchM, stretch[0][1] - stretch[0][0]);
+      const double s = stretch[0][entry] + (entry == 0 ? inward : -inward);
+      const double taper =
+          inward > 0.5 * kTaperStretchM
+              ? std::clamp((radius - RadiusAt(landmark, s)) / inward, 0.0, kMaxTaper)
+              : 0.0;
+      const double base_radius = radius + taper * length;
+      const double base_sigma = std::hypot(sigma, kTaperSigma * length);
+      AddInferred({first_id, -1},
+                  InferredSection(base + length * outward, base, base_radius, radius, base_sigma, sigma),
+                  config_.max_section_length_m,
+                  &sections[c]);
+    };
     if (hang[c].parent >= 0) {
       if (hang[c].gap < -0.01) trim(0, true, -hang[c].gap);
-      if (hang[c].gap > config_.min_gap_m) {
-        const auto [base, radius, sigma] = at(0, true);
-        AddInferred(
-            {first_id, -1},
-            InferredSection(base + hang[c].gap * outward, base, radius, radius, sigma, sigma),
-            config_.max_section_length_m,
-            &sections[c]);
-      }
+      if (hang[c].gap > config_.min_gap_m) add_base(hang[c].gap);
     } else if (is_tree[c] && ground && outward.z() < -0.5) {
-      const auto [base, radius, sigma] = at(0, true);
+      const Vector3d base = std::get<0>(at(0, true));
       foot_of[c] = ground(base.head<2>());
       const double down = foot_of[c] ? (base.z() - foot_of[c]->z_m) / -outward.z() : 0.0;
-      if (down > config_.min_gap_m && down <= config_.max_trunk_base_m) {
-        AddInferred({first_id, -1},
-                    InferredSection(base + down * outward, base, radius, radius, sigma, sigma),
-                    config_.max_section_length_m,
-                    &sections[c]);
-      }
+      if (down > config_.min_gap_m && down <= config_.max_trunk_base_m) add_base(down);
     }
     for (int k = 0; k < num_links; ++k) {
       const Link& link = chain.links[k];
@@ -1242,8 +1271,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
     const auto start_radius = [](const MapCylinder& s) {
       return std::max(0.0, s.radius_m - 0.5 * s.taper_m_per_m * s.Length());
     };
-    branch.base_radius_m = start_radius(*first_measured);
-    branch.base_radius_sigma_m = first_measured->radius_sigma_m;
+    branch.base_radius_m = start_radius(sections[c].front().cylinder);
+    branch.base_radius_sigma_m = sections[c].front().cylinder.radius_sigma_m;
     const MapCylinder& last = sections[c].back().cylinder;
     branch.tip_radius_m = std::max(0.0, last.radius_m + 0.5 * last.taper_m_per_m * last.Length());
     double walked = 0.0;

@@ -103,8 +103,10 @@ class World {
     fit.start_s_m = -half;
     fit.end_s_m = half;
     fit.end_sigma_m = 0.05;
-    fit.num_points = static_cast<int>(200.0 * half);
     fit.num_rings = 6;
+    // As many as there are beams over its width.
+    fit.num_points = std::max(
+        10, static_cast<int>(fit.num_rings * 2.0 * r / (0.0035 * fit.distance_m)));
     fit.visible_arc_rad = 2.5;
     fit.mean_abs_deviation_m = 0.008;
     return fit;

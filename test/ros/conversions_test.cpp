@@ -226,6 +226,8 @@ TEST(ScanCylinders, RoundTrip) {
   fit.taper_m_per_m = -0.02;
   fit.taper_sigma_m_per_m = 0.01;
   fit.taper_estimated = true;
+  fit.bend_information << 0.1, 0.2, 0.2, 0.5;
+  fit.bend_vector << 0.03, -0.04;
   fit.start_s_m = -0.4;
   fit.end_s_m = 0.5;
   fit.end_sigma_m = 0.05;
@@ -244,6 +246,8 @@ TEST(ScanCylinders, RoundTrip) {
   EXPECT_EQ(read[0].covariance, fit.covariance);
   EXPECT_EQ(read[0].taper_m_per_m, -0.02);
   EXPECT_TRUE(read[0].taper_estimated);
+  EXPECT_EQ(read[0].bend_information, fit.bend_information);
+  EXPECT_EQ(read[0].bend_vector, fit.bend_vector);
   EXPECT_EQ(read[0].end_s_m, 0.5);
   EXPECT_EQ(read[0].num_rings, 6);
   EXPECT_EQ(read[0].mean_abs_deviation_m, 0.007);

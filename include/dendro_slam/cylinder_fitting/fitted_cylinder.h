@@ -37,6 +37,11 @@ struct FittedCylinder {
   double taper_m_per_m = 0.0;      ///< dr/ds along `cylinder.axis`.
   double taper_sigma_m_per_m = 0.0;
   bool taper_estimated = false;    ///< False: the segment is too short to show it; taper is 0.
+  /// What the returns say of the axis' second derivative b [1/m] in PerpendicularBasis(axis): a
+  /// gaussian in natural parameters, N(J^-1 h, J^-1), without any prior; zero where they say nothing.
+  /// `cylinder` is the straight line with the least mean square distance from the bent axis.
+  Eigen::Matrix2d bend_information = Eigen::Matrix2d::Zero();  ///< J [m^2].
+  Eigen::Vector2d bend_vector = Eigen::Vector2d::Zero();       ///< h [m].
   double start_s_m = 0.0;          ///< Lower end of the inliers along the axis from the anchor [m].
   double end_s_m = 0.0;            ///< Upper end of the inliers along the axis from the anchor [m].
   double end_sigma_m = 0.0;        ///< What the ring spacing leaves unknown of either end [m].

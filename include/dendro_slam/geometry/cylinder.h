@@ -67,6 +67,11 @@ Matrix5d CylinderTangentTransform(const Eigen::Isometry3d& T_a_b, const Cylinder
 /// @return Shape (5, 5).
 Matrix5d CylinderSlideJacobian(const Cylinder& cylinder, double s);
 
+/// Jacobian of the tangent coordinates when the axis turns a little, or to its opposite: the
+/// perpendicular basis of the one in that of the other. A covariance transforms as `J C J^T`.
+/// @return Shape (5, 5).
+Matrix5d CylinderTurnJacobian(const Eigen::Vector3d& from_axis, const Eigen::Vector3d& to_axis);
+
 /// The axis with the thesis' sign convention, for display and files only (section 4.3): +Z when
 /// possible, +Y for axes in the XY plane, +X for the X axis.
 Eigen::Vector3d DisplayAxis(const Eigen::Vector3d& axis);

@@ -14,12 +14,14 @@ struct RadiusKnot {
   double radius_m = 0.0;
   double radius_sigma_m = 0.0;  ///< Honest: errors common to scans from one side are kept.
   int num_scans = 0;            ///< Observations that covered this place.
+  /// The bent axis beside the straight one, across it, in the landmark's frame [m].
+  Eigen::Vector3d offset_m = Eigen::Vector3d::Zero();
 };
 
 /// One cylinder of the map: a line with an extent and a radius profile along it.
 ///
 /// Curvature does not involve poses, so a taper costs nothing: the line is one variable of the
-/// factor graph, the radius is a function along it.
+/// factor graph, the radius is a function along it. So is the course of a bent axis beside the line.
 struct Landmark {
   static constexpr int kArcBins = 36;  ///< 10 degrees each around the axis.
 
@@ -41,6 +43,16 @@ struct Landmark {
   double RadiusAt(double s_m) const;
   /// Sigma of RadiusAt [m].
   double RadiusSigmaAt(double s_m) const;
+  /// The axis at s, bends included [m].
+  Eigen::Vector3d PointAt(double s_m) const;
+  /// Its unit direction there, towards larger s.
+  Eigen::Vector3d AxisAt(double s_m) const;
+  /// The straight line with the least mean square distance from the axis between two places, its
+  /// anchor in the middle between them. Curvature as `cylinder`.
+  Cylinder LineOver(double s_begin_m, double s_end_m) const;
 };
+
+/// A landmark in another frame: `T_a_b * landmark_b`.
+Landmark TransformLandmark(const Eigen::Isometry3d& T_a_b, const Landmark& landmark_b);
 
 }  // namespace dendro

@@ -28,7 +28,7 @@ struct MapperConfig {
   // Odometry. The messages' own covariances do not tell the drift.
   double vio_walk_m_per_sqrt_m = 0.02;    ///< Random walk per axis per root metre travelled, slow drift
                                           ///< included. >= 0.
-  double vio_walk_rad_per_sqrt_m = 0.003; ///< Random walk of the heading per root metre [rad]. >= 0.
+  double vio_walk_rad_per_sqrt_m = 0.002; ///< Random walk of the heading per root metre [rad]. >= 0.
   double vio_tilt_walk_rad_per_sqrt_m = 0.001;  ///< Of roll and pitch: gravity is seen [rad]. >= 0.
   double vio_sigma_m_per_m = 0.006;     ///< Scale error: translation drift per metre travelled. >= 0.
   double vio_sigma_per_rad = 0.005;     ///< Rotation drift per radian turned. >= 0.
@@ -51,10 +51,13 @@ struct MapperConfig {
 
   // Observations.
   double observation_scale = 1.5;       ///< The fits' sigmas are multiplied by this. > 0.
-  double observation_axis_floor_deg = 0.1;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
+  double observation_axis_floor_deg = 0.5;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
   double observation_offset_floor_m = 0.002;  ///< Added to the line's sigma [m]. >= 0.
-  double robust_width = 2.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
+  double robust_width = 1.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
                                         ///< weight (Huber). > 0.
+  double min_fill = 0.65;               ///< A fit is not mapped when fewer of the beams that should have met
+                                        ///< the surface seen returned from it: several twigs, no branch. In [0, 1).
+  double column_step_deg = 0.2;         ///< Of the lidar, for that: between two beams of one ring [deg]. > 0.
   double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
   int nearby_max = 48;                  ///< Nor more than the nearest ones. >= 1.
   double min_radius_m = 0.008;          ///< Thinner fits are not mapped [m]. > 0.
@@ -105,6 +108,8 @@ struct MapperConfig {
     v("observation_axis_floor_deg", observation_axis_floor_deg);
     v("observation_offset_floor_m", observation_offset_floor_m);
     v("robust_width", robust_width);
+    v("min_fill", min_fill);
+    v("column_step_deg", column_step_deg);
     v("nearby_radius_m", nearby_radius_m);
     v("nearby_max", nearby_max);
     v("min_radius_m", min_radius_m);
@@ -126,6 +131,8 @@ struct MapperConfig {
 struct MapSnapshot {
   int next_landmark_id = 0;
   bool upright = false;                  ///< The map's z axis is up (odometry was there at the start).
+  /// The ground as z over x and y (z, dz/dx, dz/dy); absent when no scan showed any.
+  std::optional<Eigen::Vector3d> ground;
   std::vector<LandmarkState> landmarks;  ///< Ascending in id; candidates included.
 };
 

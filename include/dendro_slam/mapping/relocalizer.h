@@ -18,6 +18,13 @@ struct RelocalizerConfig {
   double min_share = 0.6;      ///< And this share of the local cylinders.
   bool upright = false;        ///< Both maps have z up ...
   double tilt_deg = 10.0;      ///< ... to within this [deg].
+  /// The ground in both maps, as z over x and y (z, dz/dx, dz/dy), where both know it: it must agree
+  /// below the cylinders to within `ground_m`.
+  std::optional<Eigen::Vector3d> local_ground, loaded_ground;
+  double ground_m = 0.25;      ///< [m].
+  /// Two cylinders that agree are enough in an upright map on known ground, when they agree this many
+  /// times better than the tolerances and nothing else agrees at all. 0: never.
+  double two_matches_margin = 1.5;
 };
 
 /// Where a local map lies in a loaded one.
@@ -33,6 +40,7 @@ struct Relocalization {
 /// same angle, distance and radii: two lines fix a rigid motion up to their directions. The motion
 /// under which most cylinders agree in line, extent and radius wins; it is then refined on all of
 /// them by least squares. Nothing is returned when too few agree or when another place fits as well.
+/// A trunk and one branch fix the motion too; gravity and the ground then have to confirm it.
 std::optional<Relocalization> Relocalize(const std::vector<Landmark>& local,
                                          const std::vector<Landmark>& loaded,
                                          const RelocalizerConfig& config);

@@ -5,6 +5,7 @@
 #include <unordered_map>
 #include <vector>
 
+#include "dendro_slam/mapping/bend_profile.h"
 #include "dendro_slam/mapping/data_association.h"
 #include "dendro_slam/mapping/landmark.h"
 #include "dendro_slam/mapping/radius_profile.h"
@@ -19,6 +20,8 @@ struct TreeMapConfig {
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
   double max_length_m = 2.0;         ///< A landmark is not extended beyond this: trunks and branches bend,
                                      ///< and are mapped as a chain of straight pieces [m]. > 0.
+  double bend_sigma_per_m = 0.15;    ///< Prior of a landmark's bend (second derivative of its axis), in
+                                     ///< each direction [1/m]. > 0.
   double coverage_cell_m = 0.05;     ///< Resolution of the extents [m]. > 0.
   double end_support = 0.15;         ///< An end lies where the coverage falls below this share of
                                      ///< the scans that cover the densest part. In (0, 1].
@@ -45,6 +48,7 @@ struct TreeMapConfig {
     v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
     v("candidate_max_gap_scans", candidate_max_gap_scans);
     v("max_length_m", max_length_m);
+    v("bend_sigma_per_m", bend_sigma_per_m);
     v("coverage_cell_m", coverage_cell_m);
     v("end_support", end_support);
     v("min_gap_m", min_gap_m);
@@ -62,9 +66,12 @@ struct TreeMapConfig {
 /// Everything the map keeps of one landmark beside its graph variable. Plain data, for files.
 struct LandmarkState {
   int id = 0;
-  Cylinder line;                     ///< The graph's variable: its anchor is the zero of every s.
+  /// The graph's variable: its anchor is the zero of every s. Where the axis is bent, the line that
+  /// touches it there.
+  Cylinder line;
   Matrix5d covariance = Matrix5d::Identity();  ///< Marginal of `line`.
   RadiusProfile profile;
+  BendProfile bend;
   int first_cell = 0;                ///< Index of coverage.front(); a cell k spans [k, k+1) * cell size.
   std::vector<int> coverage;         ///< Scans that saw wood in the cell.
   double end_sigma_m = 0.05;         ///< Ring spacing leaves this unknown of an end; mean over the scans.
@@ -135,6 +142,13 @@ class TreeMap {
   /// Cuts a landmark; the longer-observed piece keeps the id.
   /// @return Id of the new piece, and whether it lies beyond the gap (at larger s).
   std::pair<int, bool> Split(const LandmarkSplit& split);
+
+  /// The course of a landmark's axis beside `State(id).line`.
+  BentAxis Bent(int id) const { return Bent(State(id)); }
+  BentAxis Bent(const LandmarkState& state) const {
+    return state.bend.Solve(
+        state.line.axis, profile_config_.knot_spacing_m, config_.bend_sigma_per_m);
+  }
 
   bool Has(int id) const;
   const LandmarkState& State(int id) const;

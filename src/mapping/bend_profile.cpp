@@ -1,0 +1,151 @@
+#include "dendro_slam/mapping/bend_profile.h"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+#include <Eigen/Cholesky>
+
+namespace dendro {
+
+BentAxis::BentAxis(int first, double spacing_m, std::vector<Eigen::Vector3d> second)
+    : first_(first), spacing_m_(spacing_m), second_(std::move(second)) {
+  // Integrated from the first knot; then the straight line that touches the course at s = 0 is
+  // taken off.
+  at_knot_.resize(second_.size());
+  for (std::size_t k = 1; k < second_.size(); ++k) {
+    const double h = spacing_m_;
+    const Eigen::Vector3d& a = second_[k - 1];
+    const Eigen::Vector3d& b = second_[k];
+    at_knot_[k].slope = at_knot_[k - 1].slope + 0.5 * h * (a + b);
+    at_knot_[k].offset =
+        at_knot_[k - 1].offset + h * at_knot_[k - 1].slope + h * h * (a / 3.0 + b / 6.0);
+  }
+  if (second_.empty()) return;
+  const AxisOffset zero = At(0.0);
+  for (std::size_t k = 0; k < at_knot_.size(); ++k) {
+    const double s = (first_ + static_cast<int>(k)) * spacing_m_;
+    at_knot_[k].offset -= zero.offset + s * zero.slope;
+    at_knot_[k].slope -= zero.slope;
+  }
+}
+
+Eigen::Vector3d BentAxis::Second(double s) const {
+  const double at = s / spacing_m_ - first_;
+  const double last = static_cast<double>(second_.size() - 1);
+  if (at <= 0.0) return second_.front();
+  if (at >= last) return second_.back();
+  const auto k = static_cast<std::size_t>(at);
+  const double f = at - static_cast<double>(k);
+  return (1.0 - f) * second_[k] + f * second_[k + 1];
+}
+
+AxisOffset BentAxis::At(double s) const {
+  AxisOffset out;
+  if (second_.empty()) return out;
+  const double at = s / spacing_m_ - first_;
+  const double last = static_cast<double>(second_.size() - 1);
+  const auto k = static_cast<std::size_t>(std::clamp(at, 0.0, last));
+  const double d = s - (first_ + static_cast<int>(k)) * spacing_m_;
+  const Eigen::Vector3d& a = second_[k];
+  const Eigen::Vector3d b = Second(s);
+  // c'' runs linearly from a to b.
+  out.slope = at_knot_[k].slope + 0.5 * d * (a + b);
+  out.offset = at_knot_[k].offset + d * at_knot_[k].slope + d * d * (a / 3.0 + b / 6.0);
+  return out;
+}
+
+AxisOffset BentAxis::Chord(double begin, double end) const {
+  AxisOffset out;
+  if (second_.empty()) return out;
+  constexpr int kSamples = 8;
+  double weight = 0.0;
+  for (int i = 0; i < kSamples; ++i) {
+    const double t = (i + 0.5) / kSamples - 0.5;
+    const AxisOffset here = At(0.5 * (begin + end) + t * (end - begin));
+    out.offset += here.offset / kSamples;
+    out.slope += t * here.offset;
+    weight += t * t;
+  }
+  const double length = end - begin;
+  out.slope = length > 1e-6 ? Eigen::Vector3d(out.slope / (weight * length))
+                            : At(0.5 * (begin + end)).slope;
+  return out;
+}
+
+BendProfile::Knot& BendProfile::KnotAt(int index) {
+  auto it = std::lower_bound(knots_.begin(), knots_.end(), index, [](const Knot& knot, int i) {
+    return knot.index < i;
+  });
+  if (it == knots_.end() || it->index != index) {
+    it = knots_.insert(it, Knot{});
+    it->index = index;
+  }
+  return *it;
+}
+
+void BendProfile::Add(const FittedCylinder& observation,
+                      const Eigen::Isometry3d& T_map_lidar,
+                      double s_begin_m,
+                      double s_end_m,
+                      double spacing_m) {
+  if (observation.bend_information.isZero() || !observation.bend_information.allFinite() ||
+      !observation.bend_vector.allFinite()) {
+    return;
+  }
+  const Eigen::Matrix<double, 3, 2> B =
+      T_map_lidar.linear() * PerpendicularBasis(observation.cylinder.axis);
+  const Eigen::Matrix3d information = B * observation.bend_information * B.transpose();
+  const Eigen::Vector3d vector = B * observation.bend_vector;
+  int first = static_cast<int>(std::ceil(s_begin_m / spacing_m));
+  int last = static_cast<int>(std::floor(s_end_m / spacing_m));
+  if (first > last) {
+    first = last = static_cast<int>(std::lround(0.5 * (s_begin_m + s_end_m) / spacing_m));
+  }
+  for (int k = first; k <= last; ++k) {
+    Knot& knot = KnotAt(k);
+    knot.information += information;
+    knot.vector += vector;
+  }
+}
+
+void BendProfile::Merge(const BendProfile& other,
+                        double offset_m,
+                        bool same_sign,
+                        double spacing_m) {
+  const double sign = same_sign ? 1.0 : -1.0;
+  for (const Knot& knot : other.knots_) {
+    const double s = offset_m + sign * knot.index * spacing_m;
+    Knot& mine = KnotAt(static_cast<int>(std::lround(s / spacing_m)));
+    mine.information += knot.information;
+    mine.vector += knot.vector;
+  }
+}
+
+BentAxis BendProfile::Solve(const Eigen::Vector3d& axis,
+                            double spacing_m,
+                            double prior_sigma_per_m) const {
+  if (knots_.empty()) return {};
+  const Eigen::Matrix3d prior =
+      Eigen::Matrix3d::Identity() / (prior_sigma_per_m * prior_sigma_per_m);
+  const int first = knots_.front().index, last = knots_.back().index;
+  std::vector<Eigen::Vector3d> second(static_cast<std::size_t>(last - first + 1),
+                                      Eigen::Vector3d::Zero());
+  for (const Knot& knot : knots_) {
+    const Eigen::Vector3d b = (knot.information + prior).ldlt().solve(knot.vector);
+    second[static_cast<std::size_t>(knot.index - first)] = b - b.dot(axis) * axis;
+  }
+  // A knot that nothing covered lies on the way from one neighbour to the other.
+  for (std::size_t k = 1; k < knots_.size(); ++k) {
+    const int a = knots_[k - 1].index, b = knots_[k].index;
+    for (int i = a + 1; i < b; ++i) {
+      const double f = static_cast<double>(i - a) / (b - a);
+      second[static_cast<std::size_t>(i - first)] =
+          (1.0 - f) * second[static_cast<std::size_t>(a - first)] +
+          f * second[static_cast<std::size_t>(b - first)];
+    }
+  }
+  return BentAxis(first, spacing_m, std::move(second));
+}
+
+}  // namespace dendro
