@@ -1021,7 +1021,7 @@ std::string TreeMapJson(const MapFiles& files) {
   for (const LandmarkState& state : files.snapshot.landmarks) {
     j["landmark_states"].push_back(LandmarkStateJson(state));
   }
-  return Pretty(j);
+  return WithChecksum(Pretty(j));
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -1049,7 +1049,7 @@ void SaveMap(const std::string& directory, const MapFiles& files, const StageTim
   contents.emplace_back("tree.ply", MeshToPly(ModelMesh(files.model, MeshColor::kByBranch)));
   if (!files.points.empty()) contents.emplace_back(kPointsFile, PointsToPly(files.points));
   if (timer != nullptr) contents.emplace_back("timing.json", TimingJson(*timer));
-  contents.emplace_back("tree_map.json", WithChecksum(TreeMapJson(files)));
+  contents.emplace_back("tree_map.json", TreeMapJson(files));
 
   MakeDirectory(directory);
   const std::filesystem::path root(directory);
