@@ -73,6 +73,17 @@ AxisOffset BentAxis::Chord(double begin, double end) const {
   return out;
 }
 
+BentAxis BentAxis::BesideChord(double begin, double end) const {
+  BentAxis out = *this;
+  const AxisOffset chord = Chord(begin, end);
+  for (std::size_t k = 0; k < out.at_knot_.size(); ++k) {
+    const double s = (first_ + static_cast<int>(k)) * spacing_m_;
+    out.at_knot_[k].offset -= chord.offset + (s - 0.5 * (begin + end)) * chord.slope;
+    out.at_knot_[k].slope -= chord.slope;
+  }
+  return out;
+}
+
 BendProfile::Knot& BendProfile::KnotAt(int index) {
   auto it = std::lower_bound(knots_.begin(), knots_.end(), index, [](const Knot& knot, int i) {
     return knot.index < i;

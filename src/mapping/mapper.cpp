@@ -95,20 +95,6 @@ double Fill(const FittedCylinder& fit, double column_step_rad) {
   return fit.num_points / std::max(beams, 1e-9);
 }
 
-// Takes an offset and a slope [map frame] off a measured line.
-FittedCylinder Straightened(const FittedCylinder& fit,
-                            const Eigen::Isometry3d& T_map_lidar,
-                            const Eigen::Vector3d& offset,
-                            const Eigen::Vector3d& slope) {
-  FittedCylinder out = fit;
-  out.cylinder.point -= T_map_lidar.linear().transpose() * offset;
-  out.cylinder.axis =
-      (fit.cylinder.axis - T_map_lidar.linear().transpose() * slope).normalized();
-  const Matrix5d turn = CylinderTurnJacobian(fit.cylinder.axis, out.cylinder.axis);
-  out.covariance = turn * fit.covariance * turn.transpose();
-  return out;
-}
-
 }  // namespace
 
 void MapperConfig::Validate() const {
@@ -268,10 +254,7 @@ class Mapper::Impl {
                                                Key to) const;
   int FindRedundantKeyFrame();
   void MaintainMap();
-  void MoveFactors(const std::vector<FactorId>& factors,
-                   Key to,
-                   const Cylinder* initial,
-                   const LandmarkState* from);
+  void MoveFactors(const std::vector<FactorId>& factors, Key to, const Cylinder* initial);
   void UpdateWaiting();
   void RefreshLines();
   void RefreshNearby(int id);
@@ -457,20 +440,6 @@ FactorPtr Mapper::Impl::ObservationFactor(int key_frame,
   const Landmark summary = map.Summary(id);
   const LandmarkState& state = map.State(id);
   FittedCylinder conditioned = Conditioned(fit, summary, T_map_lidar);
-  // The fit is a straight line beside a bent axis, the variable touches that axis at its anchor.
-  const BentAxis bent = map.Bent(state);
-  if (!bent.straight()) {
-    const Eigen::Vector3d anchor = T_map_lidar * fit.cylinder.point;
-    const Eigen::Vector3d axis = T_map_lidar.linear() * fit.cylinder.axis;
-    const double sign = axis.dot(state.line.axis) < 0.0 ? -1.0 : 1.0;
-    const double s = (anchor - state.line.point).dot(state.line.axis);
-    const double a = s + sign * fit.start_s_m, b = s + sign * fit.end_s_m;
-    const AxisOffset chord = bent.Chord(std::min(a, b), std::max(a, b));
-    conditioned = Straightened(conditioned,
-                               T_map_lidar,
-                               chord.offset + (s - 0.5 * (a + b)) * chord.slope,
-                               sign * chord.slope);
-  }
   // The variable's curvature is that at its own anchor: bring the measured one there along the
   // profile, so that a taper does not pull.
   const double s_variable = (state.line.point - summary.cylinder.point).dot(summary.cylinder.axis);
@@ -713,12 +682,8 @@ void Mapper::Impl::MaintainMap() {
     const std::optional<LandmarkMerge> merge = map.FindDuplicate(config.association);
     if (!merge) break;
     wait_for(LandmarkKey(merge->keep_id), LandmarkKey(merge->drop_id));
-    const LandmarkState dropped = map.State(merge->drop_id);
+    MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)), LandmarkKey(merge->keep_id), nullptr);
     map.Merge(*merge);
-    MoveFactors(solver.FactorsOf(LandmarkKey(merge->drop_id)),
-                LandmarkKey(merge->keep_id),
-                nullptr,
-                &dropped);
     marginals.erase(merge->drop_id);
   }
   for (int i = 0; i < 3; ++i) {
@@ -742,7 +707,7 @@ void Mapper::Impl::MaintainMap() {
       if ((s > middle) == piece.second) moved.push_back(factor);
     }
     if (!moved.empty()) {
-      MoveFactors(moved, LandmarkKey(piece.first), &line, nullptr);
+      MoveFactors(moved, LandmarkKey(piece.first), &line);
     } else {
       // Nothing of this session fell on it: what an earlier one knew holds for both pieces.
       waiting.values.Insert(LandmarkKey(piece.first), Value(line));
@@ -757,53 +722,16 @@ void Mapper::Impl::MaintainMap() {
 }
 
 // Hangs observations of one landmark on another one, which `initial` creates, with the next update.
-// `from`, unless both have one line, is the landmark that they were straightened for.
 void Mapper::Impl::MoveFactors(const std::vector<FactorId>& factors,
                                Key to,
-                               const Cylinder* initial,
-                               const LandmarkState* from) {
-  BentAxis old_axis, new_axis;
-  const LandmarkState* keep = nullptr;
-  if (from != nullptr) {
-    keep = &map.State(static_cast<int>(KeyIndex(to)));
-    old_axis = map.Bent(*from);
-    new_axis = map.Bent(*keep);
-  }
-  const auto straighten = [&](const Cylinder& measured,
-                              const Matrix5d& covariance,
-                              const Eigen::Isometry3d& T_map_lidar) {
-    FittedCylinder fit;
-    fit.cylinder = measured;
-    fit.covariance = covariance;
-    if (keep == nullptr || (old_axis.straight() && new_axis.straight())) return fit;
-    const Eigen::Vector3d p = T_map_lidar * measured.point;
-    const Eigen::Vector3d a = T_map_lidar.linear() * measured.axis;
-    const AxisOffset before = old_axis.At((p - from->line.point).dot(from->line.axis));
-    const AxisOffset after = new_axis.At((p - keep->line.point).dot(keep->line.axis));
-    const double sign_before = a.dot(from->line.axis) < 0.0 ? -1.0 : 1.0;
-    const double sign_after = a.dot(keep->line.axis) < 0.0 ? -1.0 : 1.0;
-    return Straightened(fit,
-                        T_map_lidar,
-                        after.offset - before.offset,
-                        sign_after * after.slope - sign_before * before.slope);
-  };
+                               const Cylinder* initial) {
   for (FactorId id : factors) {
     const FactorPtr& factor = solver.GetFactor(id);
     if (const auto* o = dynamic_cast<const CylinderFactor*>(factor.get())) {
-      const FittedCylinder fit =
-          straighten(o->measured(),
-                     o->covariance(),
-                     solver.Estimate<Eigen::Isometry3d>(o->keys()[0]));
-      waiting.factors.push_back(std::make_shared<CylinderFactor>(o->keys()[0],
-                                                           to,
-                                                           fit.cylinder,
-                                                           fit.covariance,
-                                                           o->parts(),
-                                                           o->noise().kernel()));
+      waiting.factors.push_back(std::make_shared<CylinderFactor>(
+          o->keys()[0], to, o->measured(), o->covariance(), o->parts(), o->noise().kernel()));
     } else if (const auto* prior = dynamic_cast<const CylinderPrior*>(factor.get())) {
-      const FittedCylinder mean =
-          straighten(prior->mean(), Matrix5d::Identity(), Eigen::Isometry3d::Identity());
-      waiting.factors.push_back(std::make_shared<CylinderPrior>(to, mean.cylinder, prior->noise()));
+      waiting.factors.push_back(std::make_shared<CylinderPrior>(to, prior->mean(), prior->noise()));
     }
     waiting.options.remove_factors.push_back(id);
   }

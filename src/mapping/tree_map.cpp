@@ -79,15 +79,11 @@ Landmark Summarize(const LandmarkState& state,
   Landmark out;
   out.id = state.id;
   out.cylinder = state.line.Slid(middle);
-  Matrix5d J = CylinderSlideJacobian(state.line, middle);
-  const BentAxis bent =
-      state.bend.Solve(state.line.axis, profile_config.knot_spacing_m, config.bend_sigma_per_m);
-  if (!bent.straight()) {
-    const AxisOffset chord = bent.Chord(extent.begin, extent.end);
-    out.cylinder.point += chord.offset;
-    out.cylinder.axis = (out.cylinder.axis + chord.slope).normalized();
-    J = CylinderTurnJacobian(state.line.axis, out.cylinder.axis) * J;
-  }
+  const Matrix5d J = CylinderSlideJacobian(state.line, middle);
+  // The graph's line is the one nearest to all that was seen: the axis bends about it.
+  const BentAxis bent = state.bend
+                            .Solve(state.line.axis, profile_config.knot_spacing_m, config.bend_sigma_per_m)
+                            .BesideChord(extent.begin, extent.end);
   out.covariance = J * state.covariance * J.transpose();
   out.s_min_m = extent.begin - middle;
   out.s_max_m = extent.end - middle;
@@ -310,21 +306,8 @@ int TreeMap::Add(const FittedCylinder& observation,
   state.covariance = covariance;
   state.first_scan = scan_number;
   states_.push_back(std::move(state));
-  LandmarkState& added = states_.back();
-  Observe(added.id, observation, T_map_lidar, scan_number);
-  // The fit is the straight line nearest to a bent axis; the landmark's touches it at the anchor.
-  const BentAxis bent = Bent(added);
-  if (!bent.straight()) {
-    const double sign =
-        (T_map_lidar.linear() * observation.cylinder.axis).dot(axis) < 0.0 ? -1.0 : 1.0;
-    const double a = sign * observation.start_s_m, b = sign * observation.end_s_m;
-    const AxisOffset chord = bent.Chord(std::min(a, b), std::max(a, b));
-    added.line.point -= chord.offset - 0.5 * (a + b) * chord.slope;
-    added.line.axis = (axis - chord.slope).normalized();
-    const Matrix5d turn = CylinderTurnJacobian(axis, added.line.axis);
-    added.covariance = turn * added.covariance * turn.transpose();
-  }
-  return added.id;
+  Observe(states_.back().id, observation, T_map_lidar, scan_number);
+  return states_.back().id;
 }
 
 void TreeMap::Observe(int id,

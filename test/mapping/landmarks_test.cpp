@@ -257,6 +257,9 @@ TEST(BentAxis, AConstantBendIsAParabola) {
     const AxisOffset chord = axis.Chord(0.1, 1.3);
     EXPECT_LT((chord.slope - 0.7 * b).norm(), 1e-12);
     EXPECT_LT((chord.offset - (0.5 * 0.7 * 0.7 + 0.6 * 0.6 / 6.0) * b).norm(), 1e-3);
+    const BentAxis beside = axis.BesideChord(0.1, 1.3);
+    EXPECT_LT((beside.At(0.9).offset - (axis.At(0.9).offset - chord.offset - 0.2 * chord.slope)).norm(), 1e-12);
+    EXPECT_LT(beside.Chord(0.1, 1.3).offset.norm() + beside.Chord(0.1, 1.3).slope.norm(), 1e-12);
   }
 }
 
@@ -272,7 +275,7 @@ FittedCylinder FitOfParabola(const Eigen::Vector3d& b, double m, double h, doubl
 }
 
 // Stretches of a bent branch, each fitted by the straight line nearest to it, make one landmark that
-// bends as it does; merging does not change that.
+// bends as it does about the line of the graph; merging does not change that.
 TEST(TreeMap, ABentBranchKeepsItsCourse) {
   const Eigen::Vector3d b(0.0, 0.1, 0.12);
   const Eigen::Isometry3d I = Eigen::Isometry3d::Identity();
@@ -281,6 +284,19 @@ TEST(TreeMap, ABentBranchKeepsItsCourse) {
   for (int scan = 2; scan < 12; ++scan) {
     map.Observe(id, FitOfParabola(b, 0.1 * (scan % 6) - 0.3, 0.5, 0.03), I, scan);
   }
+  // As the graph does: the line nearest to all that was seen.
+  const auto set_line = [&] {
+    const Landmark seen = map.Summary(id);
+    const double x0 = seen.cylinder.point.x() - 3.0, dx = seen.cylinder.axis.x();
+    const double lo = x0 + std::min(seen.s_min_m * dx, seen.s_max_m * dx);
+    const double hi = x0 + std::max(seen.s_min_m * dx, seen.s_max_m * dx);
+    Cylinder nearest = FitOfParabola(b, 0.5 * (lo + hi), 0.5 * (hi - lo), 0.03).cylinder;
+    const Cylinder& now = map.State(id).line;  // Its anchor and its sense stay.
+    nearest.point += (now.point.x() - nearest.point.x()) / nearest.axis.x() * nearest.axis;
+    if (nearest.axis.dot(now.axis) < 0.0) nearest.axis = -nearest.axis;
+    map.SetLine(id, nearest, 1e-4 * Matrix5d::Identity());
+  };
+  set_line();
   const auto check = [&](const Landmark& l) {
     for (const double s : {0.9 * l.s_min_m, 0.0, 0.9 * l.s_max_m}) {
       const Eigen::Vector3d p = l.PointAt(s);
@@ -307,6 +323,7 @@ TEST(TreeMap, ABentBranchKeepsItsCourse) {
 
   const int other = map.Add(FitOfParabola(b, 0.4, 0.4, 0.03), I, 12);
   map.Merge({id, other});
+  set_line();
   check(map.Summary(id));
 }
 

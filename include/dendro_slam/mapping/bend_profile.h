@@ -15,8 +15,8 @@ struct AxisOffset {
   Eigen::Vector3d slope = Eigen::Vector3d::Zero();
 };
 
-/// A bent axis as its second derivative along a straight one: c(0) = 0, c'(0) = 0, c'' linear between
-/// the knots and constant beyond them. Across the straight axis, in its frame.
+/// A bent axis as its second derivative along a straight one: c'' linear between the knots and constant
+/// beyond them; c(0) = 0 and c'(0) = 0 at first. Across the straight axis, in its frame.
 class BentAxis {
  public:
   BentAxis() = default;
@@ -29,6 +29,8 @@ class BentAxis {
   /// The straight line with the least mean square distance from the stretch [begin, end]: its offset
   /// at the middle of the stretch, and its slope.
   AxisOffset Chord(double begin, double end) const;
+  /// The same course beside its chord of a stretch in place of the line that touches it at s = 0.
+  BentAxis BesideChord(double begin, double end) const;
 
  private:
   Eigen::Vector3d Second(double s) const;

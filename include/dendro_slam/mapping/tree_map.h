@@ -143,13 +143,6 @@ class TreeMap {
   /// @return Id of the new piece, and whether it lies beyond the gap (at larger s).
   std::pair<int, bool> Split(const LandmarkSplit& split);
 
-  /// The course of a landmark's axis beside `State(id).line`.
-  BentAxis Bent(int id) const { return Bent(State(id)); }
-  BentAxis Bent(const LandmarkState& state) const {
-    return state.bend.Solve(
-        state.line.axis, profile_config_.knot_spacing_m, config_.bend_sigma_per_m);
-  }
-
   bool Has(int id) const;
   const LandmarkState& State(int id) const;
   /// The landmark as the rest of the program sees it, anchor at the middle of its extent.
