@@ -26,6 +26,8 @@ constexpr double kConverged = 1e-3;
 constexpr double kLargestCycle = 25.0;
 // A footprint of thin rays still leaves the silhouette this uncertain a width [m].
 constexpr double kThinnestBeam = 1e-3;
+// Thin wood of few rings needs some length to be told from a joint.
+constexpr double kThinM = 0.06;
 constexpr int kFewRings = 6;
 constexpr double kShortest = 4.0;  // Length over radius.
 // Returns of one branch farther apart in time lie on both sides of where a revolution begins.
@@ -778,8 +780,9 @@ FittedCylinder SegmentFit::Fit() {
   if (out.visible_arc_rad < config_.min_visible_arc_deg * kDegree) {
     return unresolved(UnresolvedReason::kArcTooSmall);
   }
-  // A few rings on something hardly longer than wide: a joint of branches or a leaf.
-  if (out.num_rings < kFewRings && out.end_s_m - out.start_s_m < kShortest * r) {
+  // A few rings on something thin and hardly longer than wide: a joint of twigs or a leaf. A short stem
+  // and the elbow of a thick arm are wood.
+  if (r < kThinM && out.num_rings < kFewRings && out.end_s_m - out.start_s_m < kShortest * r) {
     return unresolved(UnresolvedReason::kNotACylinder);
   }
   const double axis_sigma = std::sqrt(std::max(estimate.covariance(0, 0), estimate.covariance(1, 1)));
