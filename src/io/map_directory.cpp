@@ -14,6 +14,7 @@
 #include <sstream>
 #include <utility>
 
+#include <boost/crc.hpp>
 #include <fmt/format.h>
 #include <nlohmann/json.hpp>
 
@@ -985,12 +986,9 @@ std::string WithChecksum(std::string text) {
   const std::size_t at = ChecksumPlace(text);
   if (at == std::string::npos) return text;
   text.replace(at, kNoChecksum.size(), kNoChecksum);
-  std::uint32_t crc = 0xffffffffU;
-  for (const char c : text) {
-    crc ^= static_cast<unsigned char>(c);
-    for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1U) ^ ((crc & 1U) != 0U ? 0xedb88320U : 0U);
-  }
-  text.replace(at, kNoChecksum.size(), fmt::format("{:08x}", ~crc));
+  boost::crc_32_type crc;
+  crc.process_bytes(text.data(), text.size());
+  text.replace(at, kNoChecksum.size(), fmt::format("{:08x}", crc.checksum()));
   return text;
 }
 

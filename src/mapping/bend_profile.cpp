@@ -6,6 +6,8 @@
 
 #include <Eigen/Cholesky>
 
+#include "dendro_slam/mapping/knots.h"
+
 namespace dendro {
 
 BentAxis::BentAxis(int first, double spacing_m, std::vector<Eigen::Vector3d> second)
@@ -56,21 +58,7 @@ AxisOffset BentAxis::At(double s) const {
 }
 
 AxisOffset BentAxis::Chord(double begin, double end) const {
-  AxisOffset out;
-  if (second_.empty()) return out;
-  constexpr int kSamples = 8;
-  double weight = 0.0;
-  for (int i = 0; i < kSamples; ++i) {
-    const double t = (i + 0.5) / kSamples - 0.5;
-    const AxisOffset here = At(0.5 * (begin + end) + t * (end - begin));
-    out.offset += here.offset / kSamples;
-    out.slope += t * here.offset;
-    weight += t * t;
-  }
-  const double length = end - begin;
-  out.slope = length > 1e-6 ? Eigen::Vector3d(out.slope / (weight * length))
-                            : At(0.5 * (begin + end)).slope;
-  return out;
+  return ChordOver(begin, end, [this](double s) { return At(s); });
 }
 
 BentAxis BentAxis::BesideChord(double begin, double end) const {
@@ -82,17 +70,6 @@ BentAxis BentAxis::BesideChord(double begin, double end) const {
     out.at_knot_[k].slope -= chord.slope;
   }
   return out;
-}
-
-BendProfile::Knot& BendProfile::KnotAt(int index) {
-  auto it = std::lower_bound(knots_.begin(), knots_.end(), index, [](const Knot& knot, int i) {
-    return knot.index < i;
-  });
-  if (it == knots_.end() || it->index != index) {
-    it = knots_.insert(it, Knot{});
-    it->index = index;
-  }
-  return *it;
 }
 
 void BendProfile::Add(const FittedCylinder& observation,
@@ -108,13 +85,9 @@ void BendProfile::Add(const FittedCylinder& observation,
       T_map_lidar.linear() * PerpendicularBasis(observation.cylinder.axis);
   const Eigen::Matrix3d information = B * observation.bend_information * B.transpose();
   const Eigen::Vector3d vector = B * observation.bend_vector;
-  int first = static_cast<int>(std::ceil(s_begin_m / spacing_m));
-  int last = static_cast<int>(std::floor(s_end_m / spacing_m));
-  if (first > last) {
-    first = last = static_cast<int>(std::lround(0.5 * (s_begin_m + s_end_m) / spacing_m));
-  }
+  const auto [first, last] = KnotsBetween(s_begin_m, s_end_m, spacing_m);
   for (int k = first; k <= last; ++k) {
-    Knot& knot = KnotAt(k);
+    Knot& knot = AtIndex(k, &knots_);
     knot.information += information;
     knot.vector += vector;
   }
@@ -127,7 +100,7 @@ void BendProfile::Merge(const BendProfile& other,
   const double sign = same_sign ? 1.0 : -1.0;
   for (const Knot& knot : other.knots_) {
     const double s = offset_m + sign * knot.index * spacing_m;
-    Knot& mine = KnotAt(static_cast<int>(std::lround(s / spacing_m)));
+    Knot& mine = AtIndex(static_cast<int>(std::lround(s / spacing_m)), &knots_);
     mine.information += knot.information;
     mine.vector += knot.vector;
   }

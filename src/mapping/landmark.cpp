@@ -1,7 +1,8 @@
 #include "dendro_slam/mapping/landmark.h"
 
 #include <algorithm>
-#include <utility>
+
+#include "dendro_slam/mapping/axis_offset.h"
 
 namespace dendro {
 
@@ -21,7 +22,7 @@ double Interpolate(const std::vector<RadiusKnot>& profile, double s, double Radi
 }
 
 // The offset at s and its slope: linear between the knots, the outer stretches go on beyond them.
-std::pair<Eigen::Vector3d, Eigen::Vector3d> Offset(const std::vector<RadiusKnot>& profile, double s) {
+AxisOffset Offset(const std::vector<RadiusKnot>& profile, double s) {
   if (profile.size() < 2) {
     return {profile.empty() ? Eigen::Vector3d::Zero() : profile.front().offset_m,
             Eigen::Vector3d::Zero()};
@@ -45,31 +46,22 @@ double Landmark::RadiusSigmaAt(double s_m) const {
 }
 
 Eigen::Vector3d Landmark::PointAt(double s_m) const {
-  return cylinder.point + s_m * cylinder.axis + Offset(profile, s_m).first;
+  return cylinder.point + s_m * cylinder.axis + Offset(profile, s_m).offset;
 }
 
 Eigen::Vector3d Landmark::AxisAt(double s_m) const {
-  return (cylinder.axis + Offset(profile, s_m).second).normalized();
+  return (cylinder.axis + Offset(profile, s_m).slope).normalized();
 }
 
 Cylinder Landmark::LineOver(double s_begin_m, double s_end_m) const {
-  const double middle = 0.5 * (s_begin_m + s_end_m), length = s_end_m - s_begin_m;
-  Cylinder line = cylinder.Slid(middle);
+  Cylinder line = cylinder.Slid(0.5 * (s_begin_m + s_end_m));
   const bool straight = std::all_of(
       profile.begin(), profile.end(), [](const RadiusKnot& k) { return k.offset_m.isZero(0.0); });
   if (straight) return line;
-  constexpr int kSamples = 8;
-  Eigen::Vector3d mean = Eigen::Vector3d::Zero(), slope = Eigen::Vector3d::Zero();
-  double weight = 0.0;
-  for (int i = 0; i < kSamples; ++i) {
-    const double t = (i + 0.5) / kSamples - 0.5;
-    const Eigen::Vector3d offset = Offset(profile, middle + t * length).first;
-    mean += offset / kSamples;
-    slope += t * offset;
-    weight += t * t;
-  }
-  line.point += mean;
-  if (length > 1e-6) line.axis = (line.axis + slope / (weight * length)).normalized();
+  const AxisOffset chord =
+      ChordOver(s_begin_m, s_end_m, [this](double s) { return Offset(profile, s); });
+  line.point += chord.offset;
+  line.axis = (line.axis + chord.slope).normalized();
   return line;
 }
 

@@ -6,6 +6,8 @@
 #include <string>
 #include <utility>
 
+#include "dendro_slam/mapping/knots.h"
+
 namespace dendro {
 
 namespace {
@@ -113,24 +115,9 @@ void RadiusProfileConfig::Validate() const {
   Require(outlier_sigma > 0.0, "outlier_sigma must be > 0");
 }
 
-RadiusProfile::Knot& RadiusProfile::KnotAt(int index) {
-  auto it = std::lower_bound(knots_.begin(), knots_.end(), index, [](const Knot& knot, int i) {
-    return knot.index < i;
-  });
-  if (it == knots_.end() || it->index != index) {
-    it = knots_.insert(it, Knot{});
-    it->index = index;
-  }
-  return *it;
-}
-
 void RadiusProfile::Add(const Observation& o, const RadiusProfileConfig& config) {
   const double spacing = config.knot_spacing_m;
-  int first = static_cast<int>(std::ceil(o.s_start_m / spacing));
-  int last = static_cast<int>(std::floor(o.s_end_m / spacing));
-  if (first > last) {
-    first = last = static_cast<int>(std::lround(0.5 * (o.s_start_m + o.s_end_m) / spacing));
-  }
+  const auto [first, last] = KnotsBetween(o.s_start_m, o.s_end_m, spacing);
   const int bin_index = DirectionBin(o.view_angle_rad, config.direction_bins) * kDistanceBins +
                         DistanceBin(o.distance_m);
   for (int k = first; k <= last; ++k) {
@@ -139,7 +126,7 @@ void RadiusProfile::Add(const Observation& o, const RadiusProfileConfig& config)
     const double variance = o.radius_sigma_m * o.radius_sigma_m +
                             o.taper_sigma_m_per_m * o.taper_sigma_m_per_m * ds * ds;
     if (!(radius > 0.0) || !(variance > 0.0) || !std::isfinite(radius + variance)) continue;
-    Knot& knot = KnotAt(k);
+    Knot& knot = AtIndex(k, &knots_);
     double weight = 1.0 / variance;
     if (knot.num_scans >= 5) {
       const Estimate now = Combine(knot.bins, config);
@@ -149,15 +136,10 @@ void RadiusProfile::Add(const Observation& o, const RadiusProfileConfig& config)
       const double difference = std::abs(radius - now.radius);
       if (difference > limit) weight *= (limit / difference) * (limit / difference);
     }
-    auto bin = std::lower_bound(
-        knot.bins.begin(), knot.bins.end(), bin_index, [](const Bin& b, int i) { return b.index < i; });
-    if (bin == knot.bins.end() || bin->index != bin_index) {
-      bin = knot.bins.insert(bin, Bin{});
-      bin->index = bin_index;
-    }
-    bin->weight += weight;
-    bin->weighted_radius += weight * radius;
-    ++bin->num_scans;
+    Bin& bin = AtIndex(bin_index, &knot.bins);
+    bin.weight += weight;
+    bin.weighted_radius += weight * radius;
+    ++bin.num_scans;
     ++knot.num_scans;
   }
 }
@@ -186,7 +168,8 @@ void RadiusProfile::Merge(const RadiusProfile& other,
   const double sign = same_sign ? 1.0 : -1.0;
   for (const Knot& knot : other.knots_) {
     const double s = offset_m + sign * knot.index * config.knot_spacing_m;
-    Knot& mine = KnotAt(static_cast<int>(std::lround(s / config.knot_spacing_m)));
+    Knot& mine =
+        AtIndex(static_cast<int>(std::lround(s / config.knot_spacing_m)), &knots_);
     mine.num_scans += knot.num_scans;
     for (const Bin& bin : knot.bins) {
       const int direction = bin.index / kDistanceBins;
@@ -194,15 +177,10 @@ void RadiusProfile::Merge(const RadiusProfile& other,
           sign * (direction + 0.5) * kTwoPi / config.direction_bins + turn_rad;
       const int index = DirectionBin(angle, config.direction_bins) * kDistanceBins +
                         bin.index % kDistanceBins;
-      auto it = std::lower_bound(
-          mine.bins.begin(), mine.bins.end(), index, [](const Bin& b, int i) { return b.index < i; });
-      if (it == mine.bins.end() || it->index != index) {
-        it = mine.bins.insert(it, Bin{});
-        it->index = index;
-      }
-      it->weight += bin.weight;
-      it->weighted_radius += bin.weighted_radius;
-      it->num_scans += bin.num_scans;
+      Bin& my_bin = AtIndex(index, &mine.bins);
+      my_bin.weight += bin.weight;
+      my_bin.weighted_radius += bin.weighted_radius;
+      my_bin.num_scans += bin.num_scans;
     }
   }
 }

@@ -196,18 +196,16 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const double offset = (d - d.dot(b.cylinder.axis) * b.cylinder.axis).norm();
       if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
       const double ra = a.RadiusAt(middle), rb = b.RadiusAt(s_b);
-      const bool a_thin = ra < rb;
       const bool differ =
           std::max(ra, rb) > kSameWoodRatio * std::min(ra, rb) &&
           std::abs(ra - rb) > 2.0 * std::hypot(a.RadiusSigmaAt(middle), b.RadiusSigmaAt(s_b));
       const bool hardly_seen =
           kFewerScans * std::min(a.num_scans, b.num_scans) < std::max(a.num_scans, b.num_scans);
+      const bool a_is_part = hardly_seen ? a.num_scans < b.num_scans : ra < rb;
       if ((differ || hardly_seen) &&
           end - begin > kSameWoodShare * std::min(length(a), length(b)) &&
-          (hardly_seen ? stays_inside(a.num_scans < b.num_scans ? a : b,
-                                      a.num_scans < b.num_scans ? b : a,
-                                      std::max(ra, rb))
-                       : stays_inside(a_thin ? a : b, a_thin ? b : a, std::max(ra, rb)))) {
+          (a_is_part ? stays_inside(a, b, std::max(ra, rb))
+                     : stays_inside(b, a, std::max(ra, rb)))) {
         dropped[a.num_scans < b.num_scans ? i : j] = true;
         continue;
       }

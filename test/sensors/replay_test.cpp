@@ -75,7 +75,9 @@ TEST_F(Replay, LapsOfACaptureAreOneUnbrokenStream) {
   std::int64_t last_stamp = 0;
   for (std::size_t i = 0; i < 3 * packets_per_lap; ++i) {
     ASSERT_TRUE(replay.Next(packet));
-    if (i > 0) EXPECT_NEAR(static_cast<double>(packet.stamp_ns - last_ns), 1327104.0, 1000.0) << i;
+    if (i > 0) {
+      EXPECT_NEAR(static_cast<double>(packet.stamp_ns - last_ns), 1327104.0, 1000.0) << i;
+    }
     last_ns = packet.stamp_ns;
     firings.clear();
     decoder.DecodeData(packet.payload.data(), packet.payload.size(), packet.stamp_ns, firings);

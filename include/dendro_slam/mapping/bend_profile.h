@@ -6,14 +6,9 @@
 
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/geometry/se3.h"
+#include "dendro_slam/mapping/axis_offset.h"
 
 namespace dendro {
-
-/// The course of an axis beside a straight line: offset c(s) [m] and slope c'(s) at a place s.
-struct AxisOffset {
-  Eigen::Vector3d offset = Eigen::Vector3d::Zero();
-  Eigen::Vector3d slope = Eigen::Vector3d::Zero();
-};
 
 /// A bent axis as its second derivative along a straight one: c'' linear between the knots and constant
 /// beyond them; c(0) = 0 and c'(0) = 0 at first. Across the straight axis, in its frame.
@@ -26,8 +21,7 @@ class BentAxis {
 
   bool straight() const { return second_.empty(); }
   AxisOffset At(double s) const;
-  /// The straight line with the least mean square distance from the stretch [begin, end]: its offset
-  /// at the middle of the stretch, and its slope.
+  /// The straight line with the least mean square distance from the stretch [begin, end] (ChordOver).
   AxisOffset Chord(double begin, double end) const;
   /// The same course beside its chord of a stretch in place of the line that touches it at s = 0.
   BentAxis BesideChord(double begin, double end) const;
@@ -73,7 +67,6 @@ class BendProfile {
   void set_knots(std::vector<Knot> knots) { knots_ = std::move(knots); }
 
  private:
-  Knot& KnotAt(int index);
   std::vector<Knot> knots_;  // ascending in index
 };
 

@@ -94,7 +94,6 @@ class RadiusProfile {
   void set_knots(std::vector<Knot> knots) { knots_ = std::move(knots); }
 
  private:
-  Knot& KnotAt(int index);
   std::vector<Knot> knots_;  // ascending in index
 };
 
