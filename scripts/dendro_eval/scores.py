@@ -63,8 +63,33 @@ def alignment(estimate, truth):
     return truth[pairs[0][1]] @ inverse(estimate[pairs[0][0]])
 
 
+def path_alignment(estimate, truth):
+    """T_truth_map with the least mean square distance between the whole paths, or None (Umeyama, "Least-squares
+    estimation of transformation parameters between two point patterns", PAMI 1991; without scale).
+
+    Where a map lies is told by its first pose; a heading that drifted before there was anything to hold it
+    turns all of the map. This takes that out: what is left is the map's own shape.
+    """
+    pairs = common_stamps(estimate, truth) if estimate and truth else []
+    if len(pairs) < 3:
+        return None
+    est = np.array([estimate[a][:3, 3] for a, _ in pairs])
+    ref = np.array([truth[b][:3, 3] for _, b in pairs])
+    est_mean, ref_mean = est.mean(axis=0), ref.mean(axis=0)
+    u, spread, vt = np.linalg.svd((ref - ref_mean).T @ (est - est_mean))
+    if spread[1] < 1e-6 * max(spread[0], 1e-12):
+        return None  # a straight path does not tell the turn about itself
+    T = np.eye(4)
+    T[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    T[:3, 3] = ref_mean - T[:3, :3] @ est_mean
+    return T
+
+
+ALIGNMENTS = {"first": alignment, "path": path_alignment}
+
+
 def trajectory_scores(estimate, truth, T_truth_map, missing=""):
-    scores = group("poses ate_rmse_m ate_max_m rpe_trans_m rpe_rot_deg")
+    scores = group("poses ate_rmse_m ate_max_m ate_path_rmse_m rpe_trans_m rpe_rot_deg")
     if T_truth_map is None:
         return explain(scores, missing or "no pose of the map has the stamp of a true pose")
     pairs = common_stamps(estimate, truth)
@@ -74,6 +99,12 @@ def trajectory_scores(estimate, truth, T_truth_map, missing=""):
     error = np.array([np.linalg.norm(e[:3, 3] - r[:3, 3]) for e, r in zip(est, ref)])
     scores["ate_rmse_m"] = float(np.sqrt(np.mean(error ** 2)))
     scores["ate_max_m"] = float(error.max())
+    T_path = path_alignment(estimate, truth)
+    if T_path is None:
+        explain(scores, "fewer than three common poses, or a straight path", ["ate_path_rmse_m"])
+    else:
+        error = [np.linalg.norm((T_path @ estimate[a])[:3, 3] - truth[b][:3, 3]) for a, b in pairs]
+        scores["ate_path_rmse_m"] = float(np.sqrt(np.mean(np.square(error))))
     # Relative error over the first pose that is at least 1 m of path further on.
     path = np.concatenate([[0.0], np.cumsum(
         [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in zip(ref, ref[1:])])])
@@ -574,9 +605,13 @@ def timing_scores(map_dir):
     return scores
 
 
-def evaluate(map_dir, truth, per_scan=False):
-    """All scores; also the per-branch details for figures and reports under branches.matched."""
-    T = alignment(map_dir.trajectory, truth.trajectory)
+def evaluate(map_dir, truth, per_scan=False, align="first"):
+    """All scores; also the per-branch details for figures and reports under branches.matched.
+
+    align: what moves the map into the truth's frame, a key of ALIGNMENTS. `trajectory.ate_path_rmse_m` is
+    always that of the path.
+    """
+    T = ALIGNMENTS[align](map_dir.trajectory, truth.trajectory)
     missing = map_dir.missing.get("trajectory.tum") or truth.missing.get("trajectory.tum") or ""
     branches, details = branch_scores(map_dir, truth, T)
     result = {

@@ -244,6 +244,7 @@ void TreeMapConfig::Validate() const {
   Require(confirm_scans >= 1, "confirm_scans must be >= 1");
   Require(confirm_ratio >= 0.0 && confirm_ratio <= 1.0, "confirm_ratio must be in [0, 1]");
   Require(confirm_radius_sigma_rel > 0.0, "confirm_radius_sigma_rel must be > 0");
+  Require(confirm_radius_sigma_m >= 0.0, "confirm_radius_sigma_m must be >= 0");
   Require(candidate_max_gap_scans >= 1, "candidate_max_gap_scans must be >= 1");
   Require(max_length_m > 0.0, "max_length_m must be > 0");
   Require(bend_sigma_per_m > 0.0, "bend_sigma_per_m must be > 0");
@@ -380,11 +381,12 @@ std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
     if (state.num_scans < config_.confirm_scans) continue;
     const double span = static_cast<double>(state.last_scan - state.first_scan + 1);
     if (state.num_scans < config_.confirm_ratio * span) continue;
-    double best = 1e9;
-    for (const RadiusKnot& knot : state.profile.Knots(profile_config_)) {
-      best = std::min(best, knot.radius_sigma_m / knot.radius_m);
-    }
-    if (best > config_.confirm_radius_sigma_rel) continue;
+    const std::vector<RadiusKnot> knots = state.profile.Knots(profile_config_);
+    const bool known = std::any_of(knots.begin(), knots.end(), [&](const RadiusKnot& knot) {
+      return knot.radius_sigma_m <= std::max(config_.confirm_radius_sigma_m,
+                                             config_.confirm_radius_sigma_rel * knot.radius_m);
+    });
+    if (!known) continue;
     state.confirmed = true;
     summaries_.erase(state.id);
   }

@@ -29,6 +29,8 @@ constexpr double kMaxForkBendDeg = 60.0;
 constexpr double kForkOpeningDeg = 25.0;
 constexpr double kForkRadiusRatio = 1.6;
 constexpr double kElbowForkRadiusRatio = 2.5;
+// What goes straight on is the same branch unless it is thinner than this part of another arm.
+constexpr double kLeaderRadiusRatio = 0.75;
 // What leaves a branch within this many of its radii from its beginning, or before it, is its sibling,
 // unless that costs this much more.
 constexpr double kSiblingRadii = 1.5;
@@ -445,8 +447,12 @@ bool IsFork(const std::vector<Piece>& pieces,
   const auto goes_on = [&](const Arm& a, const Arm& b) {
     return IsElbow(pieces[a.piece], 1 - a.end, pieces[b.piece], b.end, config);
   };
+  double thickest = 0.0;
+  for (const Arm& a : arms) thickest = std::max(thickest, a.radius);
   for (const Arm& a : arms) {
-    if (!elbow && a.bend < kStraightOnDeg * kDeg) return false;
+    if (!elbow && a.bend < kStraightOnDeg * kDeg && a.radius > kLeaderRadiusRatio * thickest) {
+      return false;
+    }
   }
   for (std::size_t i = 0; i < arms.size(); ++i) {
     for (std::size_t k = i + 1; k < arms.size(); ++k) {

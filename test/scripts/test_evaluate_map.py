@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 sys.path.insert(0, os.path.join(ROOT, "scripts"))
@@ -13,7 +15,7 @@ sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 from dendro_eval.files import MapDirectory, Truth  # noqa: E402
 from dendro_eval.ground import ground_height  # noqa: E402
-from dendro_eval.scores import evaluate  # noqa: E402
+from dendro_eval.scores import alignment, evaluate, path_alignment, trajectory_scores  # noqa: E402
 from map_maker import MAP, write_labels, write_map, write_segments, write_truth  # noqa: E402
 
 
@@ -48,7 +50,8 @@ def test_perfect_map_scores_perfect(tmp_path):
     assert tree["height_error_m"] == pytest.approx(0.0)
     assert s["timing"]["realtime_factor"] == 2.0
     assert s["timing"]["stages"]["total"]["p99_ms"] == 45.0
-    assert "reasons" not in b and "reasons" not in s["trajectory"]
+    # The path of these maps is straight.
+    assert "reasons" not in b and set(s["trajectory"]["reasons"]) == {"ate_path_rmse_m"}
 
 
 def test_frame_of_the_map_does_not_matter(tmp_path):
@@ -264,3 +267,36 @@ def test_breast_height_counts_from_the_ground(tmp_path):
         tree = evaluate(MapDirectory(str(tmp_path / "map")), Truth(str(tmp_path / "truth")))["trees"][0]
         assert tree["dbh_truth_m"] == pytest.approx(expected, abs=1e-9)
         assert tree["height_error_m"] == pytest.approx(height, abs=1e-6)
+
+
+def test_path_alignment_takes_a_turned_map_back():
+    # A helix as truth; the estimate is turned by 2 degrees about its first pose, as when the heading drifts
+    # before anything holds it.
+    def pose(angle):
+        T = np.eye(4)
+        T[:3, 3] = [4.5 * np.cos(angle), 4.5 * np.sin(angle), 1.0 + 0.2 * angle]
+        return T
+
+    truth = {k * 10 ** 8: pose(0.1 * k) for k in range(100)}
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", 2.0, degrees=True).as_matrix()
+    first = truth[0]
+    estimate = {k: first @ turn @ np.linalg.inv(first) @ T for k, T in truth.items()}
+    t = trajectory_scores(estimate, truth, path_alignment(estimate, truth))
+    assert t["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    assert t["ate_path_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    turned, _ = Rotation.align_vectors([T[:3, 3] - first[:3, 3] for T in truth.values()],
+                                       [T[:3, 3] - first[:3, 3] for T in estimate.values()])
+    assert path_alignment(estimate, truth)[:3, :3] == pytest.approx(turned.as_matrix(), abs=1e-9)
+    # With the first pose given, as the default has it, the turn is an error of the path.
+    estimate[0] = truth[0]
+    t = trajectory_scores(estimate, truth, alignment(estimate, truth))
+    assert t["ate_rmse_m"] > 0.1 and t["ate_path_rmse_m"] < 1e-9
+
+
+def test_a_straight_path_does_not_tell_its_turn():
+    truth = {k: np.block([[np.eye(3), np.array([[0.1 * k], [0.0], [0.0]])], [np.zeros((1, 3)), 1.0]])
+             for k in range(10)}
+    assert path_alignment(truth, truth) is None
+    t = trajectory_scores(truth, truth, alignment(truth, truth))
+    assert t["ate_path_rmse_m"] is None and "straight" in t["reasons"]["ate_path_rmse_m"]

@@ -15,10 +15,10 @@ struct CylinderFitterConfig {
 
   int min_points = 8;          ///< Fewer returns: UNRESOLVED. >= 6.
   int min_rings = 3;           ///< Fewer rings: UNRESOLVED. >= 2.
-  double min_radius_m = 0.01;  ///< Thinner: UNRESOLVED [m]. > 0.
+  double min_radius_m = 0.003; ///< Thinner: UNRESOLVED [m]. > 0.
   double max_radius_m = 0.8;   ///< Thicker: UNRESOLVED [m]. > min_radius_m.
   double min_visible_arc_deg = 60.0;       ///< Less surface seen: UNRESOLVED [deg]. > 0.
-  double max_radius_sigma_ratio = 0.25;    ///< Largest sigma_r / r of a measurement. > 0.
+  double max_radius_sigma_ratio = 0.4;     ///< Largest sigma_r / r of a measurement. > 0.
   double max_axis_sigma_deg = 12.0;        ///< Largest sigma of the axis direction [deg]. > 0.
   double max_residual_sigma_m = 0.024;     ///< More scatter along the beam: not a cylinder [m]. > 0.
 

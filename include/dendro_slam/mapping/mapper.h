@@ -60,7 +60,7 @@ struct MapperConfig {
   double column_step_deg = 0.2;         ///< Of the lidar, for that: between two beams of one ring [deg]. > 0.
   double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
   int nearby_max = 48;                  ///< Nor more than the nearest ones. >= 1.
-  double min_radius_m = 0.008;          ///< Thinner fits are not mapped [m]. > 0.
+  double min_radius_m = 0.003;          ///< Thinner fits are not mapped [m]. > 0.
   double max_radius_sigma_rel = 0.5;    ///< Fits that know their radius worse are not mapped. > 0.
 
   // Finding a loaded map again.

@@ -16,7 +16,8 @@ namespace dendro {
 struct TreeMapConfig {
   int confirm_scans = 8;             ///< A candidate becomes map when this many scans saw it. >= 1.
   double confirm_ratio = 0.3;        ///< And this share of the scans from its first to its last. In [0, 1].
-  double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known this well. > 0.
+  double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known to this part of it. > 0.
+  double confirm_radius_sigma_m = 0.004;   ///< Or to this: a twig is known by where it is [m]. >= 0.
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
   double max_length_m = 2.0;         ///< A landmark is not extended beyond this: trunks and branches bend,
                                      ///< and are mapped as a chain of straight pieces [m]. > 0.
@@ -46,6 +47,7 @@ struct TreeMapConfig {
     v("confirm_scans", confirm_scans);
     v("confirm_ratio", confirm_ratio);
     v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
+    v("confirm_radius_sigma_m", confirm_radius_sigma_m);
     v("candidate_max_gap_scans", candidate_max_gap_scans);
     v("max_length_m", max_length_m);
     v("bend_sigma_per_m", bend_sigma_per_m);
