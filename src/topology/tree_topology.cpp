@@ -456,10 +456,13 @@ bool IsFork(const std::vector<Piece>& pieces,
   }
   for (std::size_t i = 0; i < arms.size(); ++i) {
     for (std::size_t k = i + 1; k < arms.size(); ++k) {
-      const double ratio =
-          std::max(arms[i].radius, arms[k].radius) / std::min(arms[i].radius, arms[k].radius);
-      if (arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) &&
-          ratio < (elbow ? kElbowForkRadiusRatio : kForkRadiusRatio) && !goes_on(arms[i], arms[k]) && !goes_on(arms[k], arms[i])) {
+      const double thick = std::max(arms[i].radius, arms[k].radius);
+      const double ratio = thick / std::min(arms[i].radius, arms[k].radius);
+      // Most of the wood turns off: the thinner arm is not the stem that goes on, either.
+      const bool alike = ratio < (elbow ? kElbowForkRadiusRatio : kForkRadiusRatio) ||
+                         (!elbow && thick > kLeaderRadiusRatio * stem.radius[end]);
+      if (alike && arms[i].away.dot(arms[k].away) < std::cos(kForkOpeningDeg * kDeg) &&
+          !goes_on(arms[i], arms[k]) && !goes_on(arms[k], arms[i])) {
         return true;
       }
     }

@@ -194,6 +194,22 @@ TEST(TreeMap, AGapSplitsAndADuplicateMerges) {
   EXPECT_EQ(twins.State(first).num_scans, 20);
 }
 
+TEST(TreeMap, ATwigIsConfirmedByMillimetresAndWoodOfUnknownThicknessIsNot) {
+  TreeMap map(TreeMapConfig{}, RadiusProfileConfig{});
+  const Eigen::Isometry3d I = Eigen::Isometry3d::Identity();
+  const FittedCylinder twig = Fit({3, 0, 0}, {0, 0, 1}, 0.5, 0.005);
+  FittedCylinder vague = Fit({4, 0, 0}, {0, 0, 1}, 0.5, 0.03);
+  vague.covariance(4, 4) = std::pow(0.3 / (0.03 * 0.03), 2);  // 30 cm of radius
+  const int twig_id = map.Add(twig, I, 1), vague_id = map.Add(vague, I, 1);
+  for (int scan = 2; scan <= 10; ++scan) {
+    map.Observe(twig_id, twig, I, scan);
+    map.Observe(vague_id, vague, I, scan);
+  }
+  EXPECT_TRUE(map.Promote(10).empty());
+  EXPECT_TRUE(map.State(twig_id).confirmed);
+  EXPECT_FALSE(map.State(vague_id).confirmed);
+}
+
 TEST(Relocalizer, FindsAnyPoseAndRefusesASymmetricScene) {
   const std::vector<Landmark> loaded{Known(4, {0, 0, 2}, {0, 0, 1}, 2.0, 0.2),
                                      Known(5, {0.8, 0.2, 2.5}, {0.8, 0.2, 0.5}, 0.6, 0.08),

@@ -368,6 +368,22 @@ TEST(TreeTopology, ArmsThatWereFittedFromInsideTheForkAreBranchesOfTheirOwn) {
   }
 }
 
+TEST(TreeTopology, AThinArmThatBendsLessIsNotTheStemIfMostOfTheWoodTurnsOff) {
+  // The palo verde's right stem and its arms as they were mapped: 11 cm goes on as 9.6 cm, 38 degrees off,
+  // and as 6.2 cm, 18 degrees off.
+  const std::vector<Landmark> landmarks = {
+      MakeLandmark(0, {5.42, -0.02, -0.80}, {4.82, -0.21, 0.45}, 0.117, 0.111),
+      MakeLandmark(1, {4.89, -0.19, 0.39}, {3.93, -0.37, 1.39}, 0.063, 0.062),
+      MakeLandmark(2, {4.81, -0.18, 0.37}, {5.04, -0.59, 1.47}, 0.107, 0.095)};
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0);
+  ASSERT_EQ(model.branches.size(), 3u);
+  for (const int id : {1, 2}) {
+    EXPECT_EQ(BranchOf(model, id).parent_id, BranchOf(model, 0).id);
+    EXPECT_EQ(BranchOf(model, id).order, 1);
+  }
+}
+
 TEST(TreeTopology, ArmsOfAForkWhoseStemEndIsHiddenAreSiblings) {
   // 35 cm of the stem below the fork were not seen: each arm is nearer to the other than to the stem.
   const std::vector<Landmark> landmarks = {
