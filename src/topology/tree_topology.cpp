@@ -809,6 +809,23 @@ struct KeyedSection {
   MapCylinder cylinder;
 };
 
+// The direction in which a branch leaves its base: that of the first measured section, which holds for
+// its middle, carried on to the base as the branch bends there.
+Vector3d DirectionAtBase(const std::vector<KeyedSection>& sections) {
+  const auto measured = [](const KeyedSection& s) { return s.cylinder.status == FitStatus::kMeasured; };
+  const auto first = std::find_if(sections.begin(), sections.end(), measured);
+  if (first == sections.end()) return Vector3d::Zero();
+  const MapCylinder& at = first->cylinder;
+  const auto next = std::next(first);
+  // Two pieces meet at an angle that says little of how the wood bends.
+  if (next == sections.end() || !measured(*next) || next->key != first->key) return at.Axis();
+  const auto middle = [](const MapCylinder& c) { return Vector3d(0.5 * (c.start + c.end)); };
+  const double step = (middle(next->cylinder) - middle(at)).norm();
+  const double back = (middle(at) - sections.front().cylinder.start).norm();
+  if (step < 1e-6) return at.Axis();
+  return (at.Axis() + std::min(back / step, 1.0) * (at.Axis() - next->cylinder.Axis())).normalized();
+}
+
 void AddInferred(const std::pair<int, int>& key,
                  const MapCylinder& whole,
                  double max_length,
@@ -1254,9 +1271,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         parent_axis = candidate.Axis();
       }
     }
-    Vector3d base_direction = Vector3d::Zero();
     double length = 0.0;
-    const MapCylinder* first_measured = nullptr;
     int position = 0;
     for (KeyedSection& section : sections[c]) {
       MapCylinder& cylinder = section.cylinder;
@@ -1267,10 +1282,6 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       cylinder.position_in_branch = position++;
       parent_cylinder = cylinder.id;
       branch.cylinder_ids.push_back(cylinder.id);
-      if (cylinder.status == FitStatus::kMeasured && first_measured == nullptr) {
-        first_measured = &cylinder;
-        base_direction = cylinder.Axis();
-      }
       length += cylinder.Length();
       model.cylinders.push_back(cylinder);
     }
@@ -1294,6 +1305,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       }
       walked += cylinder.Length();
     }
+    const Vector3d base_direction = DirectionAtBase(sections[c]);
     branch.angle_rad =
         p >= 0 ? std::acos(std::clamp(base_direction.dot(parent_axis), -1.0, 1.0)) : 0.0;
     branch.azimuth_rad = std::atan2(base_direction.y(), base_direction.x());
