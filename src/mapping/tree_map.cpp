@@ -153,6 +153,7 @@ void Clip(double begin, double end, Landmark* landmark) {
 std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
   constexpr double kMaxAngleDeg = 20.0;
   constexpr double kMaxOffsetRadii = 0.8;
+  constexpr double kTwigsApartM = 0.025;  // Thin wood side by side more closely is the same wood.
   constexpr double kMinRest = 0.25;  // A piece of which less is left lies within the other one.
   constexpr double kMinRestM = 0.1;
   // The same wood measured twice has one radius: a piece that stays in another's wood along this share of
@@ -194,8 +195,8 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const double s_b = (p - b.cylinder.point).dot(b.cylinder.axis);
       const Eigen::Vector3d d = p - b.PointAt(s_b);
       const double offset = (d - d.dot(b.cylinder.axis) * b.cylinder.axis).norm();
-      if (offset > kMaxOffsetRadii * std::max(a.RadiusAt(middle), b.RadiusAt(s_b))) continue;
       const double ra = a.RadiusAt(middle), rb = b.RadiusAt(s_b);
+      if (offset > std::max(kMaxOffsetRadii * std::max(ra, rb), kTwigsApartM)) continue;
       const bool differ =
           std::max(ra, rb) > kSameWoodRatio * std::min(ra, rb) &&
           std::abs(ra - rb) > 2.0 * std::hypot(a.RadiusSigmaAt(middle), b.RadiusSigmaAt(s_b));
@@ -204,8 +205,8 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const bool a_is_part = hardly_seen ? a.num_scans < b.num_scans : ra < rb;
       if ((differ || hardly_seen) &&
           end - begin > kSameWoodShare * std::min(length(a), length(b)) &&
-          (a_is_part ? stays_inside(a, b, std::max(ra, rb))
-                     : stays_inside(b, a, std::max(ra, rb)))) {
+          (a_is_part ? stays_inside(a, b, std::max({ra, rb, kTwigsApartM}))
+                     : stays_inside(b, a, std::max({ra, rb, kTwigsApartM})))) {
         dropped[a.num_scans < b.num_scans ? i : j] = true;
         continue;
       }
@@ -260,6 +261,7 @@ void TreeMapConfig::Validate() const {
   Require(merge_inside_angle_deg >= 0.0 && merge_inside_angle_deg < 90.0,
           "merge_inside_angle_deg must be in [0, 90)");
   Require(merge_inside_radii >= 0.0, "merge_inside_radii must be >= 0");
+  Require(merge_inside_m >= 0.0, "merge_inside_m must be >= 0");
 }
 
 TreeMap::TreeMap(TreeMapConfig config, RadiusProfileConfig profile_config)
@@ -427,8 +429,10 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
       if (std::abs(along) > config_.merge_reach_m) continue;
       // A bound on the offset that is looked at below, wherever along b it is taken.
       const double reach = kMaxSlope * std::max(std::abs(b.s_min_m), std::abs(b.s_max_m)) +
-                           kMaxOffsetRadii * std::max(0.5, config_.merge_inside_radii) *
-                               std::max(thickest[i], thickest[j]) +
+                           kMaxOffsetRadii *
+                               std::max(std::max(0.5, config_.merge_inside_radii) *
+                                            std::max(thickest[i], thickest[j]),
+                                        config_.merge_inside_m) +
                            association.offset_sigma_floor_m + kMaxBendM;
       if (apart.squaredNorm() - along * along > reach * reach) continue;
       FittedCylinder as_observation;
@@ -441,14 +445,15 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
           as_observation, a, Eigen::Isometry3d::Identity(), Matrix6d::Zero(), gates);
       const double shorter = std::min(a.s_max_m - a.s_min_m, b.s_max_m - b.s_min_m);
       if (r.overlap_m < std::min(config_.merge_min_overlap, shorter)) continue;
-      if (r.offset_m > std::max(0.5, config_.merge_inside_radii) *
-                               std::max(r.landmark_radius_m, r.radius_m) +
-                           association.offset_sigma_floor_m) {
+      const double thicker = std::max(r.landmark_radius_m, r.radius_m);
+      const double inside_m =
+          std::max(config_.merge_inside_radii * thicker, config_.merge_inside_m);
+      if (r.offset_m > std::max(0.5 * thicker, inside_m) + association.offset_sigma_floor_m) continue;
+      if (thicker > association.max_radius_ratio * std::min(r.landmark_radius_m, r.radius_m) &&
+          std::abs(r.landmark_radius_m - r.radius_m) >
+              config_.merge_gate_sigma * r.radius_difference_sigma_m) {
         continue;
       }
-      const double ratio =
-          std::max(r.radius_m / r.landmark_radius_m, r.landmark_radius_m / r.radius_m);
-      if (ratio > association.max_radius_ratio) continue;
       const double merged_length =
           (a.s_max_m - a.s_min_m) + (b.s_max_m - b.s_min_m) - std::max(0.0, r.overlap_m);
       if (merged_length > config_.max_length_m) continue;
@@ -458,8 +463,7 @@ std::optional<LandmarkMerge> TreeMap::FindDuplicate(
       // inside each other.
       const bool inside = r.overlap_m >= config_.merge_inside_overlap * shorter &&
                           r.angle_rad < config_.merge_inside_angle_deg * kRadPerDeg &&
-                          r.offset_m < config_.merge_inside_radii *
-                                           std::max(r.landmark_radius_m, r.radius_m);
+                          r.offset_m < inside_m;
       if (!(mahalanobis2 <= gate) && !inside) continue;
       // A confirmed landmark is kept before a candidate, the older before the younger.
       const bool swap = b.confirmed && !a.confirmed;

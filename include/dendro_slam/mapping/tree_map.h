@@ -37,7 +37,9 @@ struct TreeMapConfig {
   double merge_inside_overlap = 0.4; ///< Branches that run inside each other over this share of the
                                      ///< shorter one are one, whatever their sigmas say. > 0.
   double merge_inside_angle_deg = 12.0;  ///< With axes at most this far apart [deg]. In [0, 90).
-  double merge_inside_radii = 0.8;   ///< And lines at most this many radii of the thicker one. >= 0.
+  double merge_inside_radii = 0.8;   ///< And lines at most this many radii of the thicker one apart. >= 0.
+  double merge_inside_m = 0.025;     ///< Or this far: the map is not better than that, and twigs do not run
+                                     ///< side by side so closely [m]. >= 0.
 
   /// @throws std::invalid_argument naming the field.
   void Validate() const;
@@ -62,6 +64,7 @@ struct TreeMapConfig {
     v("merge_inside_overlap", merge_inside_overlap);
     v("merge_inside_angle_deg", merge_inside_angle_deg);
     v("merge_inside_radii", merge_inside_radii);
+    v("merge_inside_m", merge_inside_m);
   }
 };
 
