@@ -18,12 +18,19 @@ namespace dendro {
 namespace {
 
 constexpr double kDegree = 0.017453292519943295;
-constexpr int kMaxIterations = 25;
+constexpr int kMaxIterations = 16;
 // Iterations whose scale is the median's; then it is the weighted mean's and the anchor stays.
 constexpr int kSettling = 3;
 // Squared length of the last step in standard deviations.
 constexpr double kConverged = 1e-3;
 constexpr double kLargestCycle = 25.0;
+// Sweeps of expectation propagation while the estimate still moves far, and later at most; and the
+// change of a message's share in its posterior precision below which they end.
+constexpr int kFirstSweeps = 3;
+constexpr int kMostSweeps = 12;
+constexpr double kSettledMessage = 1e-3;
+// Scatter, in units of the largest of a cylinder, at which no more iterations are spent.
+constexpr double kHopeless = 1.5;
 // A footprint of thin rays still leaves the silhouette this uncertain a width [m].
 constexpr double kThinnestBeam = 1e-3;
 // Thin wood of few rings needs some length to be told from a joint.
@@ -68,8 +75,12 @@ struct Edge {
 struct Interval {
   StateVector g;
   double low, high, sigma;
-  // Gaussian message of expectation propagation, in natural parameters of g . x.
+  // Gaussian message of expectation propagation, in natural parameters of g . x from the middle of
+  // the interval, so that it stays right when the estimate, from which x is counted, moves.
   double precision = 0.0, shift = 0.0;
+  bool fresh = true;     // It has no message yet.
+  std::size_t edge = 0;  // Which one of SegmentFit::edges_.
+  double middle() const { return 0.5 * (low + high); }
 };
 
 struct Posterior {
@@ -88,6 +99,7 @@ double NormalCdf(double x) { return 0.5 * std::erfc(-x * 0.7071067811865476); }
 Posterior Propagate(const StateMatrix& information,
                     const StateVector& vector,
                     double outlier,
+                    int max_sweeps,
                     std::vector<Interval>* intervals) {
   Posterior out;
   out.covariance = information.ldlt().solve(StateMatrix::Identity());
@@ -95,23 +107,31 @@ Posterior Propagate(const StateMatrix& information,
   if (intervals->empty()) return out;
   // Start with every bracket believed, as a uniform error within it; a thin branch's ranges alone
   // may lie so far off that each bracket by itself would look false.
-  StateMatrix precision = information;
-  StateVector natural = vector;
   for (Interval& i : *intervals) {
+    if (!i.fresh) continue;
     const double half = 0.5 * (i.high - i.low);
     i.precision = 1.0 / (half * half / 3.0 + i.sigma * i.sigma);
-    i.shift = i.precision * 0.5 * (i.high + i.low);
-    precision += i.precision * i.g * i.g.transpose();
-    natural += i.shift * i.g;
+    i.shift = 0.0;
+    i.fresh = false;
   }
-  out.covariance = precision.ldlt().solve(StateMatrix::Identity());
-  out.mean = out.covariance * natural;
-  for (int sweep = 0; sweep < 12; ++sweep) {
+  const auto sum = [&]() {
+    StateMatrix precision = information;
+    StateVector natural = vector;
+    for (const Interval& i : *intervals) {
+      precision.noalias() += (i.precision * i.g).lazyProduct(i.g.transpose());
+      natural += (i.shift + i.precision * i.middle()) * i.g;
+    }
+    out.covariance = precision.ldlt().solve(StateMatrix::Identity());
+    out.mean = out.covariance.lazyProduct(natural);
+  };
+  sum();
+  for (int sweep = 0; sweep < max_sweeps; ++sweep) {
     double change = 0.0;
     for (Interval& i : *intervals) {
-      const StateVector Cg = out.covariance * i.g;
+      const StateVector Cg = out.covariance.lazyProduct(i.g);
       const double v = i.g.dot(Cg);
-      const double m = i.g.dot(out.mean);
+      const double middle = i.middle();
+      const double m = i.g.dot(out.mean) - middle;
       const double cavity_precision = 1.0 / v - i.precision;
       if (!(cavity_precision > 1e-9 / v)) continue;
       const double vc = 1.0 / cavity_precision;
@@ -119,8 +139,9 @@ Posterior Propagate(const StateMatrix& information,
       // Moments of the noisy edge within the bracket, then of the edge itself.
       const double total = vc + i.sigma * i.sigma;
       const double s = std::sqrt(total);
-      const double a = (i.low - mc) / s;
-      const double b = (i.high - mc) / s;
+      const double half = 0.5 * (i.high - i.low);
+      const double a = (-half - mc) / s;
+      const double b = (half - mc) / s;
       const double inside = NormalCdf(b) - NormalCdf(a);
       double mean = mc, variance = vc;
       const double mass = (1.0 - outlier) * inside;
@@ -147,20 +168,12 @@ Posterior Propagate(const StateMatrix& information,
       i.precision += d_precision;
       i.shift += d_shift;
       out.mean += Cg * ((d_shift - d_precision * m) / denominator);
-      out.covariance -= Cg * Cg.transpose() * (d_precision / denominator);
+      out.covariance.noalias() -= (Cg * (d_precision / denominator)).lazyProduct(Cg.transpose());
       change = std::max(change, std::abs(d_precision) * v);
     }
-    // Rank-one updates drift; start the next sweep from the sums.
-    precision = information;
-    natural = vector;
-    for (const Interval& i : *intervals) {
-      precision += i.precision * i.g * i.g.transpose();
-      natural += i.shift * i.g;
-    }
-    out.covariance = precision.ldlt().solve(StateMatrix::Identity());
-    out.mean = out.covariance * natural;
-    if (change < 1e-4) break;
+    if (change < kSettledMessage) break;
   }
+  sum();  // Rank-one updates drift.
   return out;
 }
 
@@ -552,9 +565,13 @@ void SegmentFit::Linearise(Estimate* estimate,
   for (int k = 0; k < 2; ++k) (*information)(k, k) += 1.0;
   for (int k = 2; k < 5; ++k) (*information)(k, k) += 1.0 / (length * length);
 
-  intervals->clear();
+  // Messages are kept from iteration to iteration; both lists are in the order of the edges.
+  std::vector<Interval> before;
+  before.swap(*intervals);
+  auto known = before.begin();
   estimate->edges = estimate->edges_violated = 0;
-  for (const Edge& edge : edges_) {
+  for (std::size_t e = 0; e < edges_.size(); ++e) {
+    const Edge& edge = edges_[e];
     BentCone::TouchJacobian touching;
     const Cone cone =
         bent.Touching(bent.StationOf(edge.hit.origin, edge.hit.direction), &touching);
@@ -592,6 +609,13 @@ void SegmentFit::Linearise(Estimate* estimate,
     const double slack =
         6.0 * beam_width * std::hypot(config_.detection_sigma, config_.detection_bias_sigma);
     if (low > slack || high < -slack) ++estimate->edges_violated;
+    interval.edge = e;
+    while (known != before.end() && known->edge < e) ++known;
+    if (known != before.end() && known->edge == e) {
+      interval.precision = known->precision;
+      interval.shift = known->shift;
+      interval.fresh = known->fresh;
+    }
     intervals->push_back(interval);
   }
 }
@@ -605,11 +629,18 @@ Estimate SegmentFit::Refine(const Cone& start) const {
   StateVector vector;
   std::vector<Interval> intervals;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
-    Linearise(&estimate, iteration < kSettling, &information, &vector, &intervals);
-    const Posterior posterior =
-        Propagate(information, vector, kOutlier, &intervals);
+    const bool settling = iteration < kSettling;
+    if (settling) intervals.clear();
+    Linearise(&estimate, settling, &information, &vector, &intervals);
+    const Posterior posterior = Propagate(information, vector, kOutlier,
+                                          settling ? kFirstSweeps : kMostSweeps, &intervals);
     if (!posterior.mean.allFinite() || !posterior.covariance.allFinite()) return estimate;
     estimate.covariance = posterior.covariance;
+    if (iteration >= 2 * kSettling &&
+        estimate.sigma > kHopeless * config_.max_residual_sigma_m) {
+      estimate.converged = true;  // On what is not a cylinder.
+      break;
+    }
     StateVector step = posterior.mean;
     const double statistical = step.dot(posterior.covariance.ldlt().solve(step));
     // Returns at the very limb enter and leave: shorter steps end such a cycle.

@@ -218,8 +218,9 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
   result.segments = separator_.Separate(result.scan);
   timer_.Add("branch_separation", stage.Lap());
   result.cylinders = fitter_.Fit(result.scan, result.segments);
-  const std::optional<GroundPlane> ground = FitGroundPlane(result.scan);
   timer_.Add("cylinder_fitting", stage.Lap());
+  const std::optional<GroundPlane> ground = FitGroundPlane(result.scan);
+  timer_.Add("ground_plane", stage.Lap());
   result.icp = icp_.AddScan(result.scan, std::nullopt);
   timer_.Add("icp", stage.Lap());
 
