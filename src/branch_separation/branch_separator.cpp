@@ -238,8 +238,8 @@ Run Separation::Part(const Run& run, int first, int last) const {
   part.row = run.row;
   part.first = std::numeric_limits<int>::max();
   for (const std::int32_t pixel : run.pixels) {
-    int col = static_cast<int>(pixel) % image_.cols;
-    while (col < run.first) col += image_.cols;
+    const int col =
+        run.first + image_.WrapColumn(static_cast<int>(pixel) % image_.cols - run.first);
     if (col < first || col > last) continue;
     part.first = std::min(part.first, col);
     part.last = col;
@@ -438,10 +438,11 @@ void Separation::ReleaseExcess() {
         ++n;
       }
       if (n < 2 || !alone) continue;
-      double sorted[2 * kWindow];
-      std::copy(width, width + n, sorted);
-      std::sort(sorted, sorted + n);
-      const double usual = n % 2 == 1 ? sorted[n / 2] : 0.5 * (sorted[n / 2 - 1] + sorted[n / 2]);
+      double part[2 * kWindow];
+      std::copy(width, width + n, part);
+      std::nth_element(part, part + n / 2, part + n);
+      const double usual =
+          n % 2 == 1 ? part[n / 2] : 0.5 * (*std::max_element(part, part + n / 2) + part[n / 2]);
       if (run.width() < config_.excess_width_ratio * usual) continue;
       // The line through the centres of the rows of usual width with the least median distance.
       double best = std::numeric_limits<double>::infinity(), expected = 0.0;

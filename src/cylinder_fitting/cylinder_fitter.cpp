@@ -41,6 +41,9 @@ constexpr double kShortest = 4.0;  // Length over radius.
 constexpr float kLongSight_s = 0.02F;
 // Sine of the angle to the axis from which two neighbours see the silhouette and not an end.
 constexpr double kLeastCrossing = 0.25;
+// Returns at the sensor and beyond this are none, nor are beams that start there [m].
+constexpr double kNearest = 1e-3;
+constexpr float kFarthest = 1e3F;
 
 // The state of the final estimator: the bent cone's tangent space and the error of the share of a
 // beam that makes a return, which shifts all edges by that part of the beam's width.
@@ -220,6 +223,11 @@ class SegmentFit {
     return std::binary_search(segment_.pixels.begin(), segment_.pixels.end(),
                               static_cast<std::int32_t>(pixel));
   }
+  // A direction that is one, from a place that is no farther than a range can be.
+  bool IsBeam(std::size_t pixel) const {
+    return std::abs(image_.beam_direction[pixel].squaredNorm() - 1.0F) < 1e-3F &&
+           image_.beam_origin[pixel].squaredNorm() < kFarthest * kFarthest;
+  }
   Beam BeamAt(std::size_t pixel, double range) const;
   Eigen::Vector3d RingAxis() const;
   std::optional<Cone> FromWidth(const Eigen::Vector3d& axis) const;
@@ -277,7 +285,7 @@ bool SegmentFit::Collect() {
     }
     const Eigen::Vector3d ray = (p - o).cast<double>();
     const double range = ray.norm();
-    if (!(range > 1e-3) || !(range < 1e3)) {
+    if (!(range > kNearest) || !(range < kFarthest) || !IsBeam(pixel)) {
       ++non_finite_;
       continue;
     }
@@ -318,7 +326,7 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
       InSegment(image_.Index(beyond_row, image_.WrapColumn(col + 2 * d_col)))) {
     return;  // A hole, not an edge.
   }
-  if (!image_.beam_direction[next].allFinite() || !image_.beam_origin[next].allFinite()) return;
+  if (!IsBeam(next)) return;
   const double range =
       static_cast<double>((image_.point[pixel] - image_.beam_origin[pixel]).norm());
   Edge edge;
@@ -341,10 +349,7 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
 void SegmentFit::CollectEdges() {
   for (const std::int32_t index : segment_.pixels) {
     const auto pixel = static_cast<std::size_t>(index);
-    if (!image_.HasReturn(pixel) || !image_.point[pixel].allFinite() ||
-        !image_.beam_direction[pixel].allFinite() || !image_.beam_origin[pixel].allFinite()) {
-      continue;
-    }
+    if (!image_.HasReturn(pixel) || !image_.point[pixel].allFinite() || !IsBeam(pixel)) continue;
     const int row = index / image_.cols;
     const int col = index % image_.cols;
     TryEdge(pixel, row, col, 0, -1);
@@ -793,7 +798,8 @@ FittedCylinder SegmentFit::Fit() {
   }
   const double r = estimate.cone.middle.radius;
   const bool finite = estimate.cone.middle.axis.allFinite() &&
-                      estimate.cone.middle.point.allFinite() && std::isfinite(r) && estimate.covariance.allFinite();
+                      estimate.cone.middle.point.allFinite() && std::isfinite(r) && estimate.covariance.allFinite() &&
+                      estimate.covariance.diagonal().minCoeff() > 0.0;
   if (!finite) return unresolved(UnresolvedReason::kNotConverged);
   if (!(r >= config_.min_radius_m) || !(r <= config_.max_radius_m)) {
     return unresolved(UnresolvedReason::kRadiusOutOfRange);

@@ -1,6 +1,9 @@
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <functional>
 #include <iostream>
+#include <limits>
 #include <map>
 #include <random>
 #include <set>
@@ -26,15 +29,18 @@ namespace {
 struct Score {
   long points = 0, pure = 0;
   long branch_points = 0, complete = 0;
-  // Returns in a segment of another branch: of its parent or child, with a shared parent, or neither;
-  // and how many of them lie in rows that also hold returns of the segment's own branch.
-  long of_kin = 0, of_siblings = 0, of_strangers = 0, in_shared_rows = 0;
+  // Returns in a segment of another branch. `at_joints`: of its parent or child, where a pixel's width
+  // on does not tell the two surfaces apart, so that whose it is is a matter of definition. Of the
+  // others of its parent or child, `beside`: in rows that also hold returns of the segment's own
+  // branch, `beyond`: in rows that do not.
+  long at_joints = 0, beside = 0, beyond = 0, of_siblings = 0, of_strangers = 0;
   int branches = 0, pieces = 0, segments = 0, found = 0;
   double seconds = 0.0;
 
   void Add(const std::vector<dendro::Segment>& separated,
            const std::vector<int>& branch_of_pixel,
            const std::map<int, int>& parent_of,
+           const std::function<bool(int branch, std::size_t pixel)>& at_surface,
            int cols,
            int min_points) {
     std::map<int, long> returns, own, segments_of;
@@ -60,9 +66,13 @@ struct Score {
         const int branch = branch_of_pixel[static_cast<std::size_t>(p)];
         if (branch == winner) continue;
         const int parent = parent_of.at(branch), winners_parent = parent_of.at(winner);
-        const bool kin = parent == winner || winners_parent == branch;
-        ++(kin ? of_kin : parent == winners_parent ? of_siblings : of_strangers);
-        in_shared_rows += static_cast<long>(own_rows.count(p / cols));
+        if (parent != winner && winners_parent != branch) {
+          ++(parent == winners_parent ? of_siblings : of_strangers);
+        } else if (at_surface(winner, static_cast<std::size_t>(p))) {
+          ++at_joints;
+        } else {
+          ++(own_rows.count(p / cols) > 0 ? beside : beyond);
+        }
       }
       points += static_cast<long>(segment.pixels.size());
       pure += best;
@@ -83,10 +93,12 @@ struct Score {
     const auto ratio = [](double a, double b) { return b > 0.0 ? nlohmann::json(a / b) : nlohmann::json(nullptr); };
     return {{"purity", ratio(static_cast<double>(pure), static_cast<double>(points))},
             {"completeness", ratio(static_cast<double>(complete), static_cast<double>(branch_points))},
-            {"impure_parent_or_child", ratio(static_cast<double>(of_kin), static_cast<double>(points))},
+            {"purity_joints_aside", ratio(static_cast<double>(pure + at_joints), static_cast<double>(points))},
+            {"impure_at_joints", ratio(static_cast<double>(at_joints), static_cast<double>(points))},
+            {"impure_beside_parent_or_child", ratio(static_cast<double>(beside), static_cast<double>(points))},
+            {"impure_beyond_parent_or_child", ratio(static_cast<double>(beyond), static_cast<double>(points))},
             {"impure_siblings", ratio(static_cast<double>(of_siblings), static_cast<double>(points))},
             {"impure_strangers", ratio(static_cast<double>(of_strangers), static_cast<double>(points))},
-            {"impure_in_shared_rows", ratio(static_cast<double>(in_shared_rows), static_cast<double>(points))},
             {"branches_found", ratio(found, branches)},
             {"pieces_per_branch", ratio(pieces, branches)},
             {"observable_branches", branches},
@@ -94,6 +106,21 @@ struct Score {
             {"ms_per_scan", ratio(1e3 * seconds, scans)}};
   }
 };
+
+/// Distance of a place from the surface of a branch, negative inside [m].
+double SurfaceDistance(const dendro::SceneBranch& branch, const Eigen::Vector3d& place) {
+  double nearest = std::numeric_limits<double>::infinity();
+  for (std::size_t i = 1; i < branch.points.size(); ++i) {
+    const auto& from = branch.points[i - 1];
+    const auto& to = branch.points[i];
+    const Eigen::Vector3d span = to.position - from.position;
+    const double t =
+        std::clamp((place - from.position).dot(span) / std::max(1e-12, span.squaredNorm()), 0.0, 1.0);
+    const double radius = from.radius_m + t * (to.radius_m - from.radius_m);
+    nearest = std::min(nearest, (place - from.position - t * span).norm() - radius);
+  }
+  return nearest;
+}
 
 }  // namespace
 
@@ -162,18 +189,27 @@ int main(int argc, char** argv) {
           scan.label[i] = dendro::SurfaceLabel(truth.kind);
           if (scan.IsWood(i)) branch[i] = truth.tree_id * 10000 + truth.branch_id;
         }
+        // A column's spacing and the noise of a range leave this much open.
+        const auto at_surface = [&](int which, std::size_t pixel) {
+          const auto& tree = scene.trees[static_cast<std::size_t>(which / 10000)];
+          const Eigen::Vector3d place = pose * scan.image.point[pixel].cast<double>();
+          const double open = static_cast<double>(scan.image.range[pixel]) * 2.0 * M_PI / scan.image.cols + 0.03;
+          return std::any_of(tree.branches.begin(), tree.branches.end(), [&](const auto& b) {
+            return b.id == which % 10000 && SurfaceDistance(b, place) < open;
+          });
+        };
         double begin = dendro::measure::ThreadCpuSeconds();
         const std::vector<dendro::Segment> mine = separator.Separate(scan);
         ours.seconds += dendro::measure::ThreadCpuSeconds() - begin;
         begin = dendro::measure::ThreadCpuSeconds();
         const std::vector<dendro::Segment> counted = thesis.Separate(scan);
         theirs.seconds += dendro::measure::ThreadCpuSeconds() - begin;
-        ours.Add(mine, branch, parent_of, scan.image.cols, min_points);
-        theirs.Add(counted, branch, parent_of, scan.image.cols, min_points);
+        ours.Add(mine, branch, parent_of, at_surface, scan.image.cols, min_points);
+        theirs.Add(counted, branch, parent_of, at_surface, scan.image.cols, min_points);
         ++scans;
         if (!json) {
           Score one;
-          one.Add(mine, branch, parent_of, scan.image.cols, min_points);
+          one.Add(mine, branch, parent_of, at_surface, scan.image.cols, min_points);
           fmt::print("scene {} view {}: {} segments, {} branches, purity {:.3f}, completeness {:.3f}\n",
                      seed + static_cast<unsigned>(s), v, mine.size(), one.branches,
                      one.points > 0 ? static_cast<double>(one.pure) / static_cast<double>(one.points) : NAN,
