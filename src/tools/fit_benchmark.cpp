@@ -18,6 +18,7 @@
 #include <pcl/sample_consensus/ransac.h>
 #include <pcl/sample_consensus/sac_model_cylinder.h>
 
+#include "cylinder_information.h"
 #include "dendro_slam/cylinder_fitting/cylinder_fitter.h"
 #include "dendro_slam/range_image/projector.h"
 #include "dendro_slam/sim/lidar_simulator.h"
@@ -42,6 +43,7 @@ struct Options {
   double beam_scale = 1.0;
   double half_length_m = 1.5;
   int min_rings = 8;
+  int bound_views = 20;
   unsigned seed = 1;
   bool json = false;
 };
@@ -152,6 +154,7 @@ std::optional<double> PclRadius(const dendro::RangeImage& image, const dendro::S
 
 /// One cylinder in an empty world, seen once without range noise.
 struct View {
+  dendro::LidarSimulatorConfig lidar;
   dendro::LabelledScan scan;
   dendro::Segment segment;
   dendro::Cylinder truth;
@@ -181,7 +184,7 @@ View Simulate(double radius, double distance, const Options& options, unsigned s
   tree.branches.push_back(branch);
   scene.trees.push_back(tree);
   const dendro::Raycaster raycaster(scene);
-  dendro::LidarSimulatorConfig lidar;
+  dendro::LidarSimulatorConfig& lidar = view.lidar;
   lidar.enable_range_noise = false;
   lidar.seed = static_cast<int>(seed);
   lidar.aperture_width_m *= options.beam_scale;
@@ -257,6 +260,9 @@ int main(int argc, char** argv) {
                  "Width of the simulated beam relative to the data sheet; the fit keeps the data sheet's")
       ->check(CLI::Range(0.0, 4.0));
   app.add_option("--min-rings", options.min_rings, "Scans with fewer rings on the cylinder are left out");
+  app.add_option("--bound-views", options.bound_views,
+                 "Scans per cell whose information makes the Cramer-Rao bound (CR%; gaussian noise only)")
+      ->check(CLI::NonNegativeNumber);
   app.add_option("--seed", options.seed, "Of everything random");
   app.add_flag("--json", options.json, "One JSON object on standard output instead of the table");
   CLI11_PARSE(app, argc, argv);
@@ -273,19 +279,30 @@ int main(int argc, char** argv) {
     Tally total;
     Tally pcl_total, marshall_total;
     if (!options.json) {
-      fmt::print("{:<12} {:>4} {:>5} | {:>6} {:>5} {:>5} {:>5} {:>5} {:>5} {:>5} {:>5} {:>6} | {:>6} {:>6} | {:>7} {:>7} {:>6}\n",
-                 "noise", "r", "dist", "bias%", "rms%", "sig%", "1sig", "2sig", "axis", "pos", "unres",
+      fmt::print("{:<12} {:>4} {:>5} | {:>6} {:>5} {:>5} {:>5} {:>5} {:>5} {:>5} {:>5} {:>5} {:>6} | {:>6} {:>6} | {:>7} {:>7} {:>6}\n",
+                 "noise", "r", "dist", "bias%", "rms%", "CR%", "sig%", "1sig", "2sig", "axis", "pos", "unres",
                  "ms", "M.bias", "M.rms", "P.bias", "P.rms", "P.ms");
     }
     const bool progress = isatty(2) != 0;
     for (const double distance : options.distances) {
       for (const double radius : options.radii) {
         std::vector<Tally> ours(noises.size()), theirs(noises.size()), simple(noises.size());
+        std::vector<dendro::Matrix5d> information(noises.size(), dendro::Matrix5d::Zero());
+        int bounded = 0;
         std::mt19937 rng(options.seed + 7u);
         for (int trial = 0; trial < options.trials; ++trial) {
           const View clean = Simulate(radius, distance, options,
                                       options.seed + 1000u * static_cast<unsigned>(trial + 1));
           if (clean.rings < options.min_rings) continue;
+          // With part of it hidden the sensor model of the bound does not hold.
+          if (bounded < options.bound_views && options.visible >= 1.0 && options.beam_scale > 0.0) {
+            for (std::size_t k = 0; k < noises.size(); ++k) {
+              if (noises[k].uniform) continue;
+              information[k] += CylinderInformation(clean.scan.image, clean.truth, options.half_length_m,
+                                                    clean.lidar, noises[k].size_m);
+            }
+            ++bounded;
+          }
           View view;
           for (std::size_t k = 0; k < noises.size(); ++k) {
             AddNoise(clean, noises[k], &rng, &view);
@@ -322,6 +339,10 @@ int main(int argc, char** argv) {
           pcl_total.Merge(theirs[k]);
           marshall_total.Merge(simple[k]);
           const int unresolved = t.fits - t.measured;
+          const double bound =
+              bounded > 0 && !noises[k].uniform
+                  ? 100.0 / radius * std::sqrt((information[k] / bounded).inverse()(4, 4))
+                  : NAN;
           const double sigma = t.measured > 0 ? 100.0 * t.sigma / t.measured / radius : NAN;
           if (options.json) {
             cells.push_back({{"noise", noises[k].name},
@@ -332,6 +353,7 @@ int main(int argc, char** argv) {
                              {"bias_percent", Number(t.Bias(radius))},
                              {"rms_percent", Number(t.Rms(radius))},
                              {"mean_sigma_percent", Number(sigma)},
+                             {"cramer_rao_rms_percent", Number(bound)},
                              {"radius_coverage_1_sigma", Number(Percent(t.one, t.measured))},
                              {"radius_coverage_2_sigma", Number(Percent(t.two, t.measured))},
                              {"axis_coverage_1_sigma", Number(Percent(t.axis_one, t.pairs))},
@@ -346,8 +368,8 @@ int main(int argc, char** argv) {
                              {"pcl_rms_percent", Number(theirs[k].Rms(radius))},
                              {"pcl_ms_per_fit", Number(theirs[k].Milliseconds())}});
           } else {
-            fmt::print("{:<12} {:>4.2f} {:>5.1f} | {:>+6.2f} {:>5.2f} {:>5.2f} {:>5.1f} {:>5.1f} {:>5.1f} {:>5.1f} {:>5} {:>6.3f} | {:>+6.2f} {:>6.2f} | {:>+7.1f} {:>7.1f} {:>6.3f}\n",
-                       noises[k].name, radius, distance, t.Bias(radius), t.Rms(radius), sigma,
+            fmt::print("{:<12} {:>4.2f} {:>5.1f} | {:>+6.2f} {:>5.2f} {:>5.2f} {:>5.2f} {:>5.1f} {:>5.1f} {:>5.1f} {:>5.1f} {:>5} {:>6.3f} | {:>+6.2f} {:>6.2f} | {:>+7.1f} {:>7.1f} {:>6.3f}\n",
+                       noises[k].name, radius, distance, t.Bias(radius), t.Rms(radius), bound, sigma,
                        Percent(t.one, t.measured), Percent(t.two, t.measured),
                        Percent(t.axis_one, t.pairs), Percent(t.position_one, t.pairs), unresolved,
                        t.Milliseconds(), simple[k].Bias(radius), simple[k].Rms(radius),
