@@ -815,6 +815,40 @@ void AddInferred(const std::pair<int, int>& key,
   }
 }
 
+// Direction in which a branch leaves its parent. Branches bend most where they begin, and the first
+// cylinder's axis is that of its middle: the line through the axes of the first cylinders (least squares,
+// by their lengths) tells the one at the base.
+class BaseDirection {
+ public:
+  // A measured cylinder that begins this far from the base along the branch [m]; ascending.
+  void Add(const MapCylinder& cylinder, double begin_m) {
+    constexpr double kReachM = 0.75;
+    if (weight_ == 0.0) first_m_ = begin_m;
+    if (begin_m > first_m_ + kReachM) return;
+    const double s = begin_m + 0.5 * cylinder.Length(), w = cylinder.Length();
+    weight_ += w;
+    s_ += w * s;
+    ss_ += w * s * s;
+    axis_ += w * cylinder.Axis();
+    s_axis_ += w * s * cylinder.Axis();
+  }
+
+  Vector3d Direction() const {
+    constexpr double kMinSpreadM = 0.1;  // RMS; less says nothing of a bend.
+    if (!(weight_ > 0.0)) return Vector3d::Zero();
+    const double middle = s_ / weight_, variance = ss_ / weight_ - middle * middle;
+    Vector3d direction = axis_ / weight_;
+    if (variance > kMinSpreadM * kMinSpreadM) {
+      direction -= middle * (s_axis_ / weight_ - middle * direction) / variance;
+    }
+    return direction.normalized();
+  }
+
+ private:
+  double weight_ = 0.0, first_m_ = 0.0, s_ = 0.0, ss_ = 0.0;
+  Vector3d axis_ = Vector3d::Zero(), s_axis_ = Vector3d::Zero();
+};
+
 }  // namespace
 
 // ---------------------------------------------------------------------------------------------
@@ -1245,9 +1279,8 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         parent_axis = candidate.Axis();
       }
     }
-    Vector3d base_direction = Vector3d::Zero();
+    BaseDirection base_direction;
     double length = 0.0;
-    const MapCylinder* first_measured = nullptr;
     int position = 0;
     for (KeyedSection& section : sections[c]) {
       MapCylinder& cylinder = section.cylinder;
@@ -1258,10 +1291,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       cylinder.position_in_branch = position++;
       parent_cylinder = cylinder.id;
       branch.cylinder_ids.push_back(cylinder.id);
-      if (cylinder.status == FitStatus::kMeasured && first_measured == nullptr) {
-        first_measured = &cylinder;
-        base_direction = cylinder.Axis();
-      }
+      if (cylinder.status == FitStatus::kMeasured) base_direction.Add(cylinder, length);
       length += cylinder.Length();
       model.cylinders.push_back(cylinder);
     }
@@ -1285,10 +1315,10 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       }
       walked += cylinder.Length();
     }
-    branch.angle_rad =
-        p >= 0 ? std::acos(std::clamp(base_direction.dot(parent_axis), -1.0, 1.0)) : 0.0;
-    branch.azimuth_rad = std::atan2(base_direction.y(), base_direction.x());
-    branch.zenith_rad = std::acos(std::clamp(base_direction.z(), -1.0, 1.0));
+    const Vector3d leaves = base_direction.Direction();
+    branch.angle_rad = p >= 0 ? std::acos(std::clamp(leaves.dot(parent_axis), -1.0, 1.0)) : 0.0;
+    branch.azimuth_rad = std::atan2(leaves.y(), leaves.x());
+    branch.zenith_rad = std::acos(std::clamp(leaves.z(), -1.0, 1.0));
     if (branch.tree_id >= 0) branch.height_m = branch.base.z() - tree_base_z[branch.tree_id];
     model.branches.push_back(branch);
   }
