@@ -16,6 +16,7 @@
 #include "dendro_slam/factor_graph/incremental_solver.h"
 #include "dendro_slam/factor_graph/prior_factor.h"
 #include "dendro_slam/mapping/level_factors.h"
+#include "dendro_slam/mapping/odometry_drift.h"
 #include "dendro_slam/mapping/relocalizer.h"
 #include "dendro_slam/sensors/lidar_scan.h"
 
@@ -31,6 +32,7 @@ void Require(bool ok, const char* message) {
 
 Key PoseKey(int index) { return MakeKey('x', static_cast<std::uint64_t>(index)); }
 constexpr Key kGroundKey = MakeKey('g', 0);
+Key DriftKey(int index) { return MakeKey('d', static_cast<std::uint64_t>(index)); }
 Key LandmarkKey(int id) { return MakeKey('l', static_cast<std::uint64_t>(id)); }
 
 bool IsPositiveDefinite(const Eigen::Ref<const Eigen::MatrixXd>& m) {
@@ -101,9 +103,13 @@ void MapperConfig::Validate() const {
   Require(key_frame_distance_m > 0.0, "key_frame_distance_m must be > 0");
   Require(key_frame_angle_deg > 0.0, "key_frame_angle_deg must be > 0");
   Require(key_frame_time_s > 0.0, "key_frame_time_s must be > 0");
+  Require(first_key_frames >= 1, "first_key_frames must be >= 1");
   Require(key_frame_cell_m > 0.0, "key_frame_cell_m must be > 0");
   Require(key_frames_per_cell >= 0, "key_frames_per_cell must be >= 0");
   Require(key_frame_window >= 1, "key_frame_window must be >= 1");
+  Require(vio_scale_sigma >= 0.0, "vio_scale_sigma must be >= 0");
+  Require(vio_drift_m_per_m >= 0.0, "vio_drift_m_per_m must be >= 0");
+  Require(vio_drift_length_m > 0.0, "vio_drift_length_m must be > 0");
   Require(vio_walk_m_per_sqrt_m >= 0.0, "vio_walk_m_per_sqrt_m must be >= 0");
   Require(vio_walk_rad_per_sqrt_m >= 0.0, "vio_walk_rad_per_sqrt_m must be >= 0");
   Require(vio_tilt_walk_rad_per_sqrt_m >= 0.0, "vio_tilt_walk_rad_per_sqrt_m must be >= 0");
@@ -180,6 +186,11 @@ class Mapper::Impl {
   std::optional<Vector6d> velocity;         // of the last step, body frame
   double last_score = 0.0;
 
+  // The slow drift of the odometry, a variable per piece of way.
+  int num_drifts = 0;
+  double drift_way_m = 0.0;                 // since the newest one
+  Eigen::Vector4d drift = Eigen::Vector4d::Zero();  // the newest one's estimate
+
   Eigen::Isometry3d T_map_odom = Eigen::Isometry3d::Identity();
   bool upright = false;
   std::int64_t scan_number = 0;
@@ -230,6 +241,10 @@ class Mapper::Impl {
   std::vector<FittedCylinder> Usable(const std::vector<FittedCylinder>& cylinders) const;
   UncertainMotion VioMotion(const Eigen::Isometry3d& T_odom_from,
                             const Eigen::Isometry3d& T_odom_to) const;
+  bool AddVioFactor(int key_frame,
+                    const Eigen::Isometry3d& T_odom_to,
+                    FactorList* factors,
+                    Values* values) const;
   void Evaluate(const std::vector<FittedCylinder>& cylinders, Hypothesis* h) const;
   FittedCylinder Conditioned(const FittedCylinder& fit,
                              const Landmark& landmark,
@@ -291,8 +306,8 @@ std::vector<FittedCylinder> Mapper::Impl::Usable(
   return out;
 }
 
-// Noise of a VIO motion: a random walk and a scale error, as visual-inertial odometry drifts. It sees
-// gravity, so its tilt drifts less than its heading.
+// A VIO motion as measured, with the noise that is left without the slow drift. VIO sees gravity, so
+// its tilt drifts less than its heading.
 UncertainMotion Mapper::Impl::VioMotion(const Eigen::Isometry3d& T_odom_from,
                                         const Eigen::Isometry3d& T_odom_to) const {
   const Eigen::Isometry3d T = T_odom_from.inverse() * T_odom_to;
@@ -312,6 +327,47 @@ UncertainMotion Mapper::Impl::VioMotion(const Eigen::Isometry3d& T_odom_from,
       tilt * Eigen::Matrix3d::Identity() + (heading - tilt) * up * up.transpose();
   out.covariance.diagonal().tail<3>().setConstant(translation);
   return out;
+}
+
+// Between-factor of the odometry from the last key frame to a new one.
+// @return  The drift that it hangs on is a new variable.
+bool Mapper::Impl::AddVioFactor(int key_frame,
+                                const Eigen::Isometry3d& T_odom_to,
+                                FactorList* factors,
+                                Values* values) const {
+  constexpr double kPiecesPerLength = 4.0;
+  constexpr double kScaleKept = 0.02;  // Of the scale's sigma: how much it changes over a piece of way.
+  constexpr double kMinSigma = 1e-6;
+  const double piece = config.vio_drift_length_m / kPiecesPerLength;
+  const bool is_new = num_drifts == 0 || drift_way_m > piece;
+  const Key key = DriftKey(is_new ? num_drifts : num_drifts - 1);
+  if (is_new) {
+    Eigen::Vector4d sigma;
+    sigma << config.vio_scale_sigma, Eigen::Vector3d::Constant(config.vio_drift_m_per_m);
+    sigma = (kDriftWayM * sigma).cwiseMax(kMinSigma);
+    Eigen::Vector4d value = Eigen::Vector4d::Zero();
+    if (num_drifts == 0) {
+      factors->push_back(std::make_shared<VectorPrior>(key, value, NoiseModel::Sigmas(sigma)));
+    } else {
+      Eigen::Vector4d keep = Eigen::Vector4d::Ones();
+      keep.tail<3>().setConstant(std::exp(-drift_way_m / config.vio_drift_length_m));
+      value = keep.cwiseProduct(drift);
+      sigma[0] = std::max(kMinSigma, kScaleKept * sigma[0]);
+      sigma.tail<3>() = (sigma.tail<3>() * std::sqrt(1.0 - keep[3] * keep[3])).cwiseMax(kMinSigma);
+      factors->push_back(std::make_shared<DriftChangeFactor>(
+          DriftKey(num_drifts - 1), key, keep, NoiseModel::Sigmas(sigma)));
+    }
+    values->Insert(key, Value(PointN(value)));
+  }
+  const UncertainMotion vio = VioMotion(*T_odom_kf, T_odom_to);
+  factors->push_back(std::make_shared<DriftingMotionFactor>(
+      PoseKey(key_frame - 1),
+      PoseKey(key_frame),
+      key,
+      vio.T,
+      T_odom_kf->linear(),
+      NoiseModel::Covariance(vio.covariance).WithKernel(RobustKernel::Huber(3.0))));
+  return is_new;
 }
 
 FittedCylinder Mapper::Impl::Conditioned(const FittedCylinder& fit,
@@ -465,6 +521,7 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
   FactorList factors;
   Values values;
   values.Insert(PoseKey(index), Value(T_map_lidar));
+  bool new_drift = false;
   if (first) {
     Vector6d sigmas = Vector6d::Constant(1e-4);
     if (start_pose) {
@@ -474,16 +531,8 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     factors.push_back(
         std::make_shared<PosePrior>(PoseKey(index), T_map_lidar, NoiseModel::Sigmas(sigmas)));
   } else {
-    bool any = false;
-    if (h.uses_vio && T_odom_kf && input.T_odom_lidar) {
-      const UncertainMotion vio = VioMotion(*T_odom_kf, *input.T_odom_lidar);
-      factors.push_back(std::make_shared<BetweenFactor>(
-          PoseKey(index - 1),
-          PoseKey(index),
-          vio.T,
-          NoiseModel::Covariance(vio.covariance).WithKernel(RobustKernel::Huber(3.0))));
-      any = true;
-    }
+    const bool any = h.uses_vio && T_odom_kf && input.T_odom_lidar;
+    if (any) new_drift = AddVioFactor(index, *input.T_odom_lidar, &factors, &values);
     if (icp_since_kf && any) {
       factors.push_back(std::make_shared<BetweenFactor>(
           PoseKey(index - 1),
@@ -577,6 +626,12 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     ++num_gone;
   }
   ++num_key_frames;
+  if (new_drift) {
+    ++num_drifts;
+    drift_way_m = 0.0;
+  }
+  drift_way_m += h.T_kf_lidar.translation().norm();
+  if (num_drifts > 0) drift = solver.Estimate<PointN>(DriftKey(num_drifts - 1));
   key_frame_scans.push_back(scan_number);
   key_frame_entries.push_back(trajectory.size());
   key_frame_stamp_ns = input.stamp_ns;
@@ -606,11 +661,20 @@ std::optional<UncertainMotion> Mapper::Impl::MotionBetween(const std::vector<Fac
   std::optional<UncertainMotion> out;
   double best = 0.0;
   for (FactorId id : factors) {
-    const auto* between = dynamic_cast<const BetweenFactor*>(solver.GetFactor(id).get());
-    if (between == nullptr || between->keys()[0] != from || between->keys()[1] != to) continue;
-    const Eigen::MatrixXd W = between->noise().sqrt_information();
+    const Factor* factor = solver.GetFactor(id).get();
+    if (factor->keys().size() < 2 || factor->keys()[0] != from || factor->keys()[1] != to) continue;
     UncertainMotion motion;
-    motion.T = between->T_from_to();
+    Eigen::MatrixXd W;
+    if (const auto* between = dynamic_cast<const BetweenFactor*>(factor)) {
+      motion.T = between->T_from_to();
+      W = between->noise().sqrt_information();
+    } else if (const auto* drifting = dynamic_cast<const DriftingMotionFactor*>(factor)) {
+      // The drift of long ago is known.
+      motion.T = drifting->Without(solver.Estimate<PointN>(drifting->keys()[2]));
+      W = drifting->noise().sqrt_information();
+    } else {
+      continue;
+    }
     motion.covariance = (W.transpose() * W).inverse();
     const double error = solver.FactorError(id);
     if (!out || (best > kOutlierError && error < best)) {
@@ -851,6 +915,7 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
     bool suspicious = false;
     if (scan.T_odom_lidar && T_odom_last) {
       vio = VioMotion(*T_odom_last, *scan.T_odom_lidar);
+      vio->T.translation() -= DriftJacobian(vio->T, T_odom_last->linear()) * drift;
       const Vector6d xi = LogSe3(vio->T);
       if (xi.tail<3>().norm() > config.max_speed_mps * dt + 0.05 ||
           xi.head<3>().norm() > config.max_turn_rad_per_s * dt + 0.05) {
@@ -935,6 +1000,7 @@ MapperResult Mapper::Impl::AddScan(const MapperInput& input) {
 
     const Vector6d since = LogSe3(best.T_kf_lidar);
     const bool key_frame =
+        num_key_frames < config.first_key_frames ||
         since.tail<3>().norm() >= config.key_frame_distance_m ||
         since.head<3>().norm() >= config.key_frame_angle_deg * kRadPerDeg ||
         NsToSeconds(scan.stamp_ns - key_frame_stamp_ns) >= config.key_frame_time_s;

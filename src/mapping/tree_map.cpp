@@ -244,6 +244,8 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
 void TreeMapConfig::Validate() const {
   Require(confirm_scans >= 1, "confirm_scans must be >= 1");
   Require(confirm_ratio >= 0.0 && confirm_ratio <= 1.0, "confirm_ratio must be in [0, 1]");
+  Require(confirm_scans_around >= 1, "confirm_scans_around must be >= 1");
+  Require(confirm_arc_deg >= 0.0, "confirm_arc_deg must be >= 0");
   Require(confirm_radius_sigma_rel > 0.0, "confirm_radius_sigma_rel must be > 0");
   Require(confirm_radius_sigma_m >= 0.0, "confirm_radius_sigma_m must be >= 0");
   Require(candidate_max_gap_scans >= 1, "candidate_max_gap_scans must be >= 1");
@@ -382,7 +384,10 @@ std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
     }
     if (state.num_scans < config_.confirm_scans) continue;
     const double span = static_cast<double>(state.last_scan - state.first_scan + 1);
-    if (state.num_scans < config_.confirm_ratio * span) continue;
+    const bool around = state.num_scans >= config_.confirm_scans_around &&
+                        static_cast<double>(state.arc_seen.count()) * 360.0 / Landmark::kArcBins >=
+                            config_.confirm_arc_deg;
+    if (state.num_scans < config_.confirm_ratio * span && !around) continue;
     const std::vector<RadiusKnot> knots = state.profile.Knots(profile_config_);
     const bool known = std::any_of(knots.begin(), knots.end(), [&](const RadiusKnot& knot) {
       return knot.radius_sigma_m <= std::max(config_.confirm_radius_sigma_m,

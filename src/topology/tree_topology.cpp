@@ -809,23 +809,6 @@ struct KeyedSection {
   MapCylinder cylinder;
 };
 
-// The direction in which a branch leaves its base: that of the first measured section, which holds for
-// its middle, carried on to the base as the branch bends there.
-Vector3d DirectionAtBase(const std::vector<KeyedSection>& sections) {
-  const auto measured = [](const KeyedSection& s) { return s.cylinder.status == FitStatus::kMeasured; };
-  const auto first = std::find_if(sections.begin(), sections.end(), measured);
-  if (first == sections.end()) return Vector3d::Zero();
-  const MapCylinder& at = first->cylinder;
-  const auto next = std::next(first);
-  // Two pieces meet at an angle that says little of how the wood bends.
-  if (next == sections.end() || !measured(*next) || next->key != first->key) return at.Axis();
-  const auto middle = [](const MapCylinder& c) { return Vector3d(0.5 * (c.start + c.end)); };
-  const double step = (middle(next->cylinder) - middle(at)).norm();
-  const double back = (middle(at) - sections.front().cylinder.start).norm();
-  if (step < 1e-6) return at.Axis();
-  return (at.Axis() + std::min(back / step, 1.0) * (at.Axis() - next->cylinder.Axis())).normalized();
-}
-
 void AddInferred(const std::pair<int, int>& key,
                  const MapCylinder& whole,
                  double max_length,
@@ -840,6 +823,40 @@ void AddInferred(const std::pair<int, int>& key,
     sections->push_back({key, i, part});
   }
 }
+
+// Direction in which a branch leaves its parent. Branches bend most where they begin, and the first
+// cylinder's axis is that of its middle: the line through the axes of the first cylinders (least squares,
+// by their lengths) tells the one at the base.
+class BaseDirection {
+ public:
+  // A measured cylinder that begins this far from the base along the branch [m]; ascending.
+  void Add(const MapCylinder& cylinder, double begin_m) {
+    constexpr double kReachM = 0.75;
+    if (weight_ == 0.0) first_m_ = begin_m;
+    if (begin_m > first_m_ + kReachM) return;
+    const double s = begin_m + 0.5 * cylinder.Length(), w = cylinder.Length();
+    weight_ += w;
+    s_ += w * s;
+    ss_ += w * s * s;
+    axis_ += w * cylinder.Axis();
+    s_axis_ += w * s * cylinder.Axis();
+  }
+
+  Vector3d Direction() const {
+    constexpr double kMinSpreadM = 0.1;  // RMS; less says nothing of a bend.
+    if (!(weight_ > 0.0)) return Vector3d::Zero();
+    const double middle = s_ / weight_, variance = ss_ / weight_ - middle * middle;
+    Vector3d direction = axis_ / weight_;
+    if (variance > kMinSpreadM * kMinSpreadM) {
+      direction -= middle * (s_axis_ / weight_ - middle * direction) / variance;
+    }
+    return direction.normalized();
+  }
+
+ private:
+  double weight_ = 0.0, first_m_ = 0.0, s_ = 0.0, ss_ = 0.0;
+  Vector3d axis_ = Vector3d::Zero(), s_axis_ = Vector3d::Zero();
+};
 
 }  // namespace
 
@@ -1271,6 +1288,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
         parent_axis = candidate.Axis();
       }
     }
+    BaseDirection base_direction;
     double length = 0.0;
     int position = 0;
     for (KeyedSection& section : sections[c]) {
@@ -1282,6 +1300,7 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       cylinder.position_in_branch = position++;
       parent_cylinder = cylinder.id;
       branch.cylinder_ids.push_back(cylinder.id);
+      if (cylinder.status == FitStatus::kMeasured) base_direction.Add(cylinder, length);
       length += cylinder.Length();
       model.cylinders.push_back(cylinder);
     }
@@ -1305,11 +1324,10 @@ TreeModel TreeTopology::Build(const std::vector<Landmark>& landmarks,
       }
       walked += cylinder.Length();
     }
-    const Vector3d base_direction = DirectionAtBase(sections[c]);
-    branch.angle_rad =
-        p >= 0 ? std::acos(std::clamp(base_direction.dot(parent_axis), -1.0, 1.0)) : 0.0;
-    branch.azimuth_rad = std::atan2(base_direction.y(), base_direction.x());
-    branch.zenith_rad = std::acos(std::clamp(base_direction.z(), -1.0, 1.0));
+    const Vector3d leaves = base_direction.Direction();
+    branch.angle_rad = p >= 0 ? std::acos(std::clamp(leaves.dot(parent_axis), -1.0, 1.0)) : 0.0;
+    branch.azimuth_rad = std::atan2(leaves.y(), leaves.x());
+    branch.zenith_rad = std::acos(std::clamp(leaves.z(), -1.0, 1.0));
     if (branch.tree_id >= 0) branch.height_m = branch.base.z() - tree_base_z[branch.tree_id];
     model.branches.push_back(branch);
   }

@@ -6,6 +6,7 @@
 #include "../factor_graph/graph_test_util.h"
 #include "dendro_slam/mapping/data_association.h"
 #include "dendro_slam/mapping/level_factors.h"
+#include "dendro_slam/mapping/odometry_drift.h"
 #include "dendro_slam/mapping/radius_profile.h"
 #include "dendro_slam/mapping/relocalizer.h"
 #include "dendro_slam/mapping/tree_map.h"
@@ -208,6 +209,32 @@ TEST(TreeMap, ATwigIsConfirmedByMillimetresAndWoodOfUnknownThicknessIsNot) {
   EXPECT_TRUE(map.Promote(10).empty());
   EXPECT_TRUE(map.State(twig_id).confirmed);
   EXPECT_FALSE(map.State(vague_id).confirmed);
+}
+
+// A thin branch is measured by few of the scans that pass it. Seen from all around it is map; as often
+// seen from one side, or a few times, it is not.
+TEST(TreeMap, WhatWasSeenFromAllAroundIsMapHoweverSeldom) {
+  const auto confirmed = [](int scans, double turn_rad) {
+    TreeMap map(TreeMapConfig{}, RadiusProfileConfig{});
+    int id = -1;
+    for (int i = 0; i < scans; ++i) {
+      Eigen::Isometry3d T_map_lidar = Eigen::Isometry3d::Identity();
+      T_map_lidar.linear() = Eigen::AngleAxisd(turn_rad * i / scans, Eigen::Vector3d::UnitZ())
+                                 .toRotationMatrix();
+      T_map_lidar.translation() = T_map_lidar.linear() * Eigen::Vector3d(-3, 0, 0);
+      const FittedCylinder fit = Fit({3, 0, 0}, {0, 0, 1}, 0.5, 0.012);
+      if (id < 0) {
+        id = map.Add(fit, T_map_lidar, 1);
+      } else {
+        map.Observe(id, fit, T_map_lidar, 1 + 8 * i);
+      }
+    }
+    EXPECT_TRUE(map.Promote(8 * scans).empty());
+    return map.State(id).confirmed;
+  };
+  EXPECT_TRUE(confirmed(30, 2.0 * M_PI));
+  EXPECT_FALSE(confirmed(30, 0.3));
+  EXPECT_FALSE(confirmed(12, 2.0 * M_PI));
 }
 
 TEST(Relocalizer, FindsAnyPoseAndRefusesASymmetricScene) {
@@ -438,6 +465,51 @@ TEST(LevelFactors, VanishAtTheTruthAndLeaveHeadingFree) {
   EXPECT_NEAR(gravity.Error(values), 0.0, 1e-18);
   EXPECT_NEAR(ground.Error(values), 0.0, 1e-18);
   EXPECT_THROW(GravityFactor(MakeKey('x', 0), 2.0 * up, NoiseModel::Unit(2)), std::invalid_argument);
+}
+
+TEST(OdometryDrift, JacobiansMatchCentralDifferences) {
+  std::mt19937 rng(6);
+  const Key from = MakeKey('x', 0), to = MakeKey('x', 1), drift = MakeKey('d', 0), later = MakeKey('d', 1);
+  for (int i = 0; i < 20; ++i) {
+    Values values;
+    const Eigen::Isometry3d T_from = test::RandomPose(rng);
+    const Eigen::Isometry3d measured = ExpSe3(test::RandomVector<6>(rng, 0.4));
+    values.Insert(from, Value(T_from));
+    values.Insert(to, Value(Eigen::Isometry3d(T_from * measured * ExpSe3(test::RandomVector<6>(rng, 0.1)))));
+    for (const Key key : {drift, later}) {
+      values.Insert(key, Value(PointN(test::RandomVector<4>(rng, 0.1))));
+    }
+    test::ExpectJacobianMatches(DriftingMotionFactor(from,
+                                                     to,
+                                                     drift,
+                                                     measured,
+                                                     test::RandomPose(rng).linear(),
+                                                     NoiseModel::Isotropic(6, 0.01)),
+                                values);
+    test::ExpectJacobianMatches(
+        DriftChangeFactor(drift, later, {1.0, 0.8, 0.8, 0.5}, NoiseModel::Isotropic(4, 0.02)), values);
+  }
+}
+
+// One per cent too long and 2 cm up per metre of way, on a motion of 3 m.
+TEST(OdometryDrift, ByHand) {
+  Eigen::Isometry3d measured = Eigen::Isometry3d::Identity();
+  measured.translation() << 3.0, 0.0, 0.0;
+  const Eigen::Matrix3d R =  // The sensor hangs upside down: up is its -z.
+      Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX()).toRotationMatrix();
+  const DriftingMotionFactor factor(
+      MakeKey('x', 0), MakeKey('x', 1), MakeKey('d', 0), measured, R, NoiseModel::Unit(6));
+  PointN drift(4);
+  drift << 0.01 * kDriftWayM, 0.0, 0.0, 0.02 * kDriftWayM;
+  EXPECT_LT((factor.Without(drift).translation() - Eigen::Vector3d(2.97, 0.0, 0.06)).norm(), 1e-12);
+  EXPECT_THROW(DriftingMotionFactor(
+                   MakeKey('x', 0), MakeKey('x', 0), MakeKey('d', 0), measured, R, NoiseModel::Unit(6)),
+               std::invalid_argument);
+  EXPECT_THROW(DriftChangeFactor(MakeKey('d', 0),
+                                 MakeKey('d', 1),
+                                 Eigen::Vector4d::Constant(1.5),
+                                 NoiseModel::Unit(4)),
+               std::invalid_argument);
 }
 
 }  // namespace

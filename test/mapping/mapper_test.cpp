@@ -120,6 +120,28 @@ TEST(Mapper, VioLostForFiveSeconds) {
   ExpectGoodMap(mapper, Fly(&mapper, &world, options), world, 0.03);
 }
 
+// Round a lone trunk nothing but the odometry tells how far the way has gone round. What it had too much
+// where branches were in view is known then.
+TEST(Mapper, TheOdometrysScaleIsLearntWhereBranchesAreInView) {
+  FlightOptions options;
+  options.vio_scale = 1.02;
+  options.trunk_only_from = 500;
+  options.climb = 0.02;
+  MapperConfig ignorant;
+  ignorant.vio_scale_sigma = 0.0;
+  ignorant.vio_drift_m_per_m = 0.0;
+  double with = 0.0, without = 0.0;
+  for (const int seed : {21, 22, 23}) {
+    World world(ThesisLikeTree(), seed), same(ThesisLikeTree(), seed);
+    Mapper learning, other(ignorant);
+    const FlightResult flight = Fly(&learning, &world, options);
+    with += TrajectoryAte(flight, learning);
+    without += TrajectoryAte(Fly(&other, &same, options), other);
+  }
+  std::printf("ATE %.3f m, with the scale unknown %.3f m\n", with / 3.0, without / 3.0);
+  EXPECT_LT(with, 0.7 * without);
+}
+
 TEST(Mapper, ATrunkDoesNotLoseItsTaper) {
   World world({ThesisLikeTree()[0], ThesisLikeTree()[1]}, 7);
   Mapper mapper;

@@ -131,7 +131,8 @@ class World {
 /// Visual-inertial odometry that drifts by about 1 % of the distance.
 class DriftingOdometry {
  public:
-  explicit DriftingOdometry(World* world) : world_(world) {}
+  /// @param scale  Length measured / true.
+  explicit DriftingOdometry(World* world, double scale = 1.005) : world_(world), scale_(scale) {}
 
   Eigen::Isometry3d Next(const Eigen::Isometry3d& T_map_lidar) {
     if (!last_) {
@@ -144,7 +145,7 @@ class DriftingOdometry {
       error[2] = 0.0026 * std::sqrt(d) * world_->Normal();
       for (int i = 3; i < 6; ++i) error[i] = 0.01 * std::sqrt(d) * world_->Normal();
       Eigen::Isometry3d scaled = step;
-      scaled.translation() *= 1.005;
+      scaled.translation() *= scale_;
       T_ = NormalizedSe3(T_ * scaled * ExpSe3(error));
     }
     last_ = T_map_lidar;
@@ -154,6 +155,7 @@ class DriftingOdometry {
 
  private:
   World* world_;
+  double scale_;
   std::optional<Eigen::Isometry3d> last_;
   Eigen::Isometry3d T_ = Eigen::Isometry3d::Identity();
 };
@@ -162,6 +164,8 @@ struct FlightOptions {
   int scans = 750;
   double radius = 4.0, speed = 1.0, z0 = 0.8, climb = 0.035;
   bool vio = true, icp = true;
+  double vio_scale = 1.005;
+  int trunk_only_from = -1;  ///< From this scan on only the first branch of the world is seen.
   int jump_at = -1;
   int vio_lost_from = -1, vio_lost_to = -1;
   double start_time = 0.0;   ///< Along the circle [s].
@@ -187,7 +191,7 @@ inline double Ate(const std::vector<Eigen::Isometry3d>& truth,
 
 inline FlightResult Fly(Mapper* mapper, World* world, const FlightOptions& o) {
   FlightResult out;
-  DriftingOdometry odometry(world);
+  DriftingOdometry odometry(world, o.vio_scale);
   std::vector<Eigen::Isometry3d> vio_poses;
   std::int64_t last_stamp = 0;
   for (int i = 0; i < o.scans; ++i) {
@@ -196,6 +200,11 @@ inline FlightResult Fly(Mapper* mapper, World* world, const FlightOptions& o) {
     MapperInput input;
     input.stamp_ns = o.first_stamp_ns + 100000000LL * i;
     input.cylinders = world->Scan(T);
+    if (o.trunk_only_from >= 0 && i >= o.trunk_only_from) {
+      std::vector<FittedCylinder>& c = input.cylinders;
+      c.erase(std::remove_if(c.begin(), c.end(), [](const auto& fit) { return fit.segment_id != 0; }),
+              c.end());
+    }
     const Eigen::Isometry3d vio = odometry.Next(T);
     if (i == o.jump_at) {
       Vector6d xi;

@@ -85,6 +85,24 @@ std::vector<Landmark> SmallTree() {
   };
 }
 
+// A branch that leaves at 60 degrees and bends by 40 degrees a metre: its first cylinder is at 50 in its
+// middle, the angle is that at the base, 6 cm along where it comes out of the trunk.
+TEST(TreeTopology, TheAngleOfABentBranchIsThatAtItsBase) {
+  std::vector<Landmark> landmarks = {MakeLandmark(1, {0, 0, 0}, {0, 0, 5.0}, 0.05, 0.05)};
+  Vector3d at(0.0, 0.0, 2.0);
+  for (int i = 0; i < 4; ++i) {
+    const double angle = (60.0 - 40.0 * (0.25 + 0.5 * i)) * kDeg;
+    const Vector3d to = at + 0.5 * Vector3d(std::sin(angle), 0.0, std::cos(angle));
+    landmarks.push_back(MakeLandmark(2 + i, at, to, 0.03 - 0.003 * i, 0.027 - 0.003 * i));
+    at = to;
+  }
+  TreeTopology topology{TopologyConfig()};
+  const TreeModel model = topology.Build(landmarks, 0);
+  const MapBranch& branch = BranchOf(model, 2);
+  EXPECT_EQ(BranchOf(model, 4).id, branch.id);
+  EXPECT_NEAR(branch.angle_rad, (60.0 - 40.0 * 0.058) * kDeg, 3.0 * kDeg);
+}
+
 TEST(TreeTopology, ASmallTreeByHand) {
   TreeTopology topology{TopologyConfig()};
   const TreeModel model = topology.Build(SmallTree(), 123);

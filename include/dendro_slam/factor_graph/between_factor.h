@@ -1,8 +1,18 @@
 #pragma once
 
 #include "dendro_slam/factor_graph/factor.h"
+#include "dendro_slam/geometry/se3.h"
 
 namespace dendro {
+
+/// `Log(T_to_from_measured * T_from^-1 * T_to)`, shape (6), rotation first, and its Jacobians for the
+/// right tangents of the poses.
+/// @param J_from, J_to  Out, shape (6, 6), both or neither null.
+Vector6d BetweenResidual(const Eigen::Isometry3d& T_to_from_measured,
+                         const Eigen::Isometry3d& T_from,
+                         const Eigen::Isometry3d& T_to,
+                         Matrix6d* J_from,
+                         Matrix6d* J_to);
 
 /// Relative motion between two poses: `r = Log(T_from_to_measured^-1 * T_from^-1 * T_to)`, shape (6),
 /// rotation first (GTSAM's BetweenFactor<Pose3>).

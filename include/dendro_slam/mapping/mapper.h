@@ -18,6 +18,8 @@ struct MapperConfig {
   double key_frame_distance_m = 0.4;    ///< Travelled since the last one [m]. > 0.
   double key_frame_angle_deg = 10.0;    ///< Turned since the last one [deg]. > 0.
   double key_frame_time_s = 10.0;       ///< Passed since the last one [s]. > 0.
+  int first_key_frames = 10;            ///< The first scans are all key frames: the map hangs on the first
+                                        ///< pose, and the error of one scan would turn all of it. >= 1.
 
   // An hour of walking the same rows must not make the graph grow: where many key frames stand already,
   // a later one is taken out again once it is old.
@@ -25,15 +27,19 @@ struct MapperConfig {
   int key_frames_per_cell = 6;          ///< Old key frames kept in a cube; 0: all of them. >= 0.
   int key_frame_window = 100;           ///< The newest ones are always kept. >= 1.
 
-  // Odometry. The messages' own covariances do not tell the drift.
-  double vio_walk_m_per_sqrt_m = 0.02;    ///< Random walk per axis per root metre travelled, slow drift
-                                          ///< included. >= 0.
-  double vio_walk_rad_per_sqrt_m = 0.002; ///< Random walk of the heading per root metre [rad]. >= 0.
+  // Odometry. The messages' own covariances do not tell the drift. What of it changes slowly is a
+  // variable of the graph (odometry_drift.h), learnt where much is in view.
+  double vio_scale_sigma = 0.01;          ///< Length measured / true - 1. >= 0.
+  double vio_drift_m_per_m = 0.006;       ///< Slow drift along each axis of the odometry's frame per metre
+                                          ///< travelled. >= 0.
+  double vio_drift_length_m = 50.0;       ///< Way over which the slow drift forgets its direction [m]. > 0.
+  double vio_walk_m_per_sqrt_m = 0.008;   ///< Random walk per axis per root metre travelled. >= 0.
+  double vio_walk_rad_per_sqrt_m = 0.0026;  ///< Random walk of the heading per root metre [rad]. >= 0.
   double vio_tilt_walk_rad_per_sqrt_m = 0.001;  ///< Of roll and pitch: gravity is seen [rad]. >= 0.
-  double vio_sigma_m_per_m = 0.006;     ///< Scale error: translation drift per metre travelled. >= 0.
+  double vio_sigma_m_per_m = 0.002;     ///< Drift per metre travelled that is not learnt, of one step. >= 0.
   double vio_sigma_per_rad = 0.005;     ///< Rotation drift per radian turned. >= 0.
-  double vio_sigma_floor_rad = 0.0008;  ///< Of one step, per axis [rad]. > 0.
-  double vio_sigma_floor_m = 0.002;     ///< Of one step, per axis [m]. > 0.
+  double vio_sigma_floor_rad = 0.0006;  ///< Of one step, per axis [rad]. > 0.
+  double vio_sigma_floor_m = 0.0015;    ///< Of one step, per axis [m]. > 0.
   double icp_scale = 1.5;               ///< ICP's sigmas are multiplied by this. > 0.
   double odometry_gate_sigma = 4.0;     ///< VIO and ICP that differ by more are not both believed. > 0.
   double max_speed_mps = 15.0;          ///< A faster step is a jump, whatever else agrees [m/s]. > 0.
@@ -84,9 +90,13 @@ struct MapperConfig {
     v("key_frame_distance_m", key_frame_distance_m);
     v("key_frame_angle_deg", key_frame_angle_deg);
     v("key_frame_time_s", key_frame_time_s);
+    v("first_key_frames", first_key_frames);
     v("key_frame_cell_m", key_frame_cell_m);
     v("key_frames_per_cell", key_frames_per_cell);
     v("key_frame_window", key_frame_window);
+    v("vio_scale_sigma", vio_scale_sigma);
+    v("vio_drift_m_per_m", vio_drift_m_per_m);
+    v("vio_drift_length_m", vio_drift_length_m);
     v("vio_walk_m_per_sqrt_m", vio_walk_m_per_sqrt_m);
     v("vio_walk_rad_per_sqrt_m", vio_walk_rad_per_sqrt_m);
     v("vio_tilt_walk_rad_per_sqrt_m", vio_tilt_walk_rad_per_sqrt_m);

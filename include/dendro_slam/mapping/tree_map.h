@@ -16,6 +16,9 @@ namespace dendro {
 struct TreeMapConfig {
   int confirm_scans = 8;             ///< A candidate becomes map when this many scans saw it. >= 1.
   double confirm_ratio = 0.3;        ///< And this share of the scans from its first to its last. In [0, 1].
+  int confirm_scans_around = 20;     ///< Or it was seen by this many scans, however many did not, >= 1,
+  double confirm_arc_deg = 240.0;    ///< and from so many sides: a thin branch is measured by few of the
+                                     ///< scans, a clump of twigs looks different from each side [deg]. >= 0.
   double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known to this part of it. > 0.
   double confirm_radius_sigma_m = 0.004;   ///< Or to this: a twig is known by where it is [m]. >= 0.
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
@@ -48,6 +51,8 @@ struct TreeMapConfig {
   void Visit(Visitor&& v) {
     v("confirm_scans", confirm_scans);
     v("confirm_ratio", confirm_ratio);
+    v("confirm_scans_around", confirm_scans_around);
+    v("confirm_arc_deg", confirm_arc_deg);
     v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
     v("confirm_radius_sigma_m", confirm_radius_sigma_m);
     v("candidate_max_gap_scans", candidate_max_gap_scans);
