@@ -18,6 +18,8 @@ struct TreeMapConfig {
   double confirm_ratio = 0.3;        ///< And this share of the scans from its first to its last. In [0, 1].
   double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known this well. > 0.
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
+  int candidate_gap_per_scan = 100;  ///< And one not seen for longer than this for every scan that saw it:
+                                     ///< most are fits that never come again. >= 1.
   double max_length_m = 2.0;         ///< A landmark is not extended beyond this: trunks and branches bend,
                                      ///< and are mapped as a chain of straight pieces [m]. > 0.
   double bend_sigma_per_m = 0.15;    ///< Prior of a landmark's bend (second derivative of its axis), in
@@ -47,6 +49,7 @@ struct TreeMapConfig {
     v("confirm_ratio", confirm_ratio);
     v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
     v("candidate_max_gap_scans", candidate_max_gap_scans);
+    v("candidate_gap_per_scan", candidate_gap_per_scan);
     v("max_length_m", max_length_m);
     v("bend_sigma_per_m", bend_sigma_per_m);
     v("coverage_cell_m", coverage_cell_m);
