@@ -504,57 +504,131 @@ void BayesTree::SolveClique(const Clique& clique, double* x) const {
 }
 
 Eigen::MatrixXd BayesTree::ForwardSolve(const std::vector<int>& selected) const {
-  // The paths to the root, deepest cliques first.
-  std::vector<std::pair<int, int>> path;  // (-depth, clique)
-  std::vector<int> depth_of(cliques_.size(), -1);
+  // The cliques on the paths to the root, every one after those below it. A column has entries only
+  // from its variable's clique upwards: with the columns in the order in which their cliques are
+  // passed, those of a subtree lie side by side.
+  struct Passed {
+    int clique = -1;
+    int first_column = 0;  // Of the cliques below it.
+    int own_column = 0;    // Of its own variables; then come those of the next clique.
+  };
+  std::vector<int> in_path(cliques_.size(), -1);  // Index in `climbed`.
   std::vector<int> climbed;
   for (const int v : selected) {
-    climbed.clear();
-    int c = graph_->states[v].clique;
-    for (; c >= 0 && depth_of[c] < 0; c = cliques_[c].parent) climbed.push_back(c);
-    int depth = c >= 0 ? depth_of[c] + 1 : 0;
-    for (auto it = climbed.rbegin(); it != climbed.rend(); ++it, ++depth) {
-      depth_of[*it] = depth;
-      path.emplace_back(-depth, *it);
+    for (int c = graph_->states[v].clique; c >= 0 && in_path[c] < 0; c = cliques_[c].parent) {
+      in_path[c] = static_cast<int>(climbed.size());
+      climbed.push_back(c);
     }
   }
-  std::sort(path.begin(), path.end());
+  std::vector<std::vector<int>> below(climbed.size());
+  std::vector<int> open;
+  for (const int c : climbed) {
+    const int parent = cliques_[c].parent;
+    if (parent < 0) {
+      open.push_back(c);
+    } else {
+      below[in_path[parent]].push_back(c);
+    }
+  }
+  std::vector<std::vector<std::pair<int, int>>> starting(climbed.size());  // (row in the clique, selected)
+  std::vector<int> row_in_clique(graph_->variables.size(), -1);
+  for (const int c : climbed) {
+    int row = 0;
+    for (int i = 0; i < cliques_[c].num_frontal; ++i) {
+      row_in_clique[cliques_[c].variables[i]] = row;
+      row += graph_->states[cliques_[c].variables[i]].dimension;
+    }
+  }
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    starting[in_path[graph_->states[selected[i]].clique]].emplace_back(row_in_clique[selected[i]],
+                                                                      static_cast<int>(i));
+  }
+  for (auto& list : starting) std::sort(list.begin(), list.end());
+
+  // Down in pre-order, which read backwards passes every clique after those below it.
+  std::vector<int> down;
+  while (!open.empty()) {
+    const int c = open.back();
+    open.pop_back();
+    down.push_back(c);
+    open.insert(open.end(), below[in_path[c]].begin(), below[in_path[c]].end());
+  }
+  std::vector<Passed> passed;
   std::vector<int> row_of(graph_->variables.size(), -1);
-  int rows = 0;
-  for (const auto& entry : path) {
-    const Clique& clique = cliques_[entry.second];
+  std::vector<int> column_of(selected.size(), 0);
+  std::vector<int> first_column(climbed.size(), 0);
+  int rows = 0, columns = 0;
+  for (auto it = down.rbegin(); it != down.rend(); ++it) {
+    const Clique& clique = cliques_[*it];
     for (int i = 0; i < clique.num_frontal; ++i) {
-      row_of[clique.variables[i]] = rows;
-      rows += graph_->states[clique.variables[i]].dimension;
+      row_of[clique.variables[i]] = rows + row_in_clique[clique.variables[i]];
+    }
+    rows += clique.frontal_dimension;
+    int first = columns;
+    for (const int child : below[in_path[*it]]) first = std::min(first, first_column[in_path[child]]);
+    first_column[in_path[*it]] = first;
+    passed.push_back({*it, first, columns});
+    for (const auto& [row, i] : starting[in_path[*it]]) {
+      column_of[i] = columns;
+      columns += graph_->states[selected[i]].dimension;
     }
   }
-  int columns = 0;
-  for (const int v : selected) columns += graph_->states[v].dimension;
+
   Eigen::MatrixXd Y = Eigen::MatrixXd::Zero(rows, columns);
-  int column = 0;
-  for (const int v : selected) {
-    for (int k = 0; k < graph_->states[v].dimension; ++k) Y(row_of[v] + k, column++) = 1.0;
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    for (int k = 0; k < graph_->states[selected[i]].dimension; ++k) {
+      Y(row_of[selected[i]] + k, column_of[i] + k) = 1.0;
+    }
   }
-  for (const auto& entry : path) {
-    const Clique& clique = cliques_[entry.second];
-    const int frontal = clique.frontal_dimension;
-    const int stride = frontal + clique.separator_dimension + 1;
-    const int first = row_of[clique.variables[0]];
-    const Eigen::Map<const Eigen::MatrixXd, 0, Eigen::OuterStride<>> L11(
-        clique.conditional.data(), frontal, frontal, Eigen::OuterStride<>(stride));
-    auto y = Y.middleRows(first, frontal);
-    L11.triangularView<Eigen::Lower>().solveInPlace(y);
-    int source = frontal;
+  constexpr int kChunk = 32;  // Columns that start together.
+  Eigen::MatrixXd passed_on;
+  for (std::size_t p = 0; p < passed.size(); ++p) {
+    const Clique& clique = cliques_[passed[p].clique];
+    const int frontal = clique.frontal_dimension, separator = clique.separator_dimension;
+    const int first_row = row_of[clique.variables[0]];
+    const int end_column = p + 1 < passed.size() ? passed[p + 1].own_column : columns;
+    using StridedMatrix = Eigen::Map<const Eigen::MatrixXd, 0, Eigen::OuterStride<>>;
+    const Eigen::OuterStride<> stride(frontal + separator + 1);
+    const StridedMatrix L11(clique.conditional.data(), frontal, frontal, stride);
+    const int inherited = passed[p].own_column - passed[p].first_column;
+    if (inherited > 0) {
+      auto y = Y.block(first_row, passed[p].first_column, frontal, inherited);
+      L11.triangularView<Eigen::Lower>().solveInPlace(y);
+    }
+    // Above the row of its variable a column stays empty.
+    const auto& own = starting[in_path[passed[p].clique]];
+    int column = passed[p].own_column;
+    for (std::size_t i = 0; i < own.size();) {
+      const int row = own[i].first;
+      int width = 0;
+      for (; i < own.size() && width < kChunk; ++i) {
+        width += graph_->states[selected[own[i].second]].dimension;
+      }
+      auto y = Y.block(first_row + row, column, frontal - row, width);
+      L11.bottomRightCorner(frontal - row, frontal - row).triangularView<Eigen::Lower>().solveInPlace(y);
+      column += width;
+    }
+    if (separator == 0) continue;
+    const StridedMatrix L21(clique.conditional.data() + frontal, separator, frontal, stride);
+    const int width = end_column - passed[p].first_column;
+    passed_on.noalias() = L21 * Y.block(first_row, passed[p].first_column, frontal, width);
+    int source = 0;
     for (std::size_t i = clique.num_frontal; i < clique.variables.size(); ++i) {
       const int v = clique.variables[i];
       const int d = graph_->states[v].dimension;
-      const Eigen::Map<const Eigen::MatrixXd, 0, Eigen::OuterStride<>> L21(
-          clique.conditional.data() + source, d, frontal, Eigen::OuterStride<>(stride));
-      Y.middleRows(row_of[v], d).noalias() -= L21 * y;
+      Y.block(row_of[v], passed[p].first_column, d, width) -= passed_on.middleRows(source, d);
       source += d;
     }
   }
-  return Y;
+
+  Eigen::MatrixXd out(rows, columns);
+  int column = 0;
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    const int d = graph_->states[selected[i]].dimension;
+    out.middleCols(column, d) = Y.middleCols(column_of[i], d);
+    column += d;
+  }
+  return out;
 }
 
 double BayesTree::Flops() const {

@@ -135,6 +135,7 @@ void MapperConfig::Validate() const {
   Require(column_step_deg > 0.0, "column_step_deg must be > 0");
   Require(nearby_radius_m > 0.0, "nearby_radius_m must be > 0");
   Require(nearby_max >= 1, "nearby_max must be >= 1");
+  Require(nearby_exact >= 1, "nearby_exact must be >= 1");
   Require(min_radius_m > 0.0, "min_radius_m must be > 0");
   Require(max_radius_sigma_rel > 0.0, "max_radius_sigma_rel must be > 0");
   Require(relocalize_axis_deg > 0.0, "relocalize_axis_deg must be > 0");
@@ -199,6 +200,7 @@ class Mapper::Impl {
   std::optional<Eigen::Isometry3d> start_pose;
 
   std::map<int, Matrix5d> marginals;  // of the landmarks' lines, as last computed
+  std::map<int, int> computed_at;     // key frame at which that was, of the landmarks in `nearby`
 
   // Key frames of long ago.
   using Cell = std::array<int, 3>;
@@ -437,12 +439,14 @@ void Mapper::Impl::Evaluate(const std::vector<FittedCylinder>& cylinders, Hypoth
 
 bool Mapper::Impl::InsideALandmark(const FittedCylinder& fit,
                                    const Eigen::Isometry3d& T_kf_lidar) const {
+  const Eigen::Vector3d middle = T_kf_lidar * fit.cylinder.point;
   for (const Landmark& l : nearby) {
+    if (std::abs((middle - l.cylinder.point).dot(l.cylinder.axis)) > config.association.max_reach_m) {
+      continue;
+    }
     const LineResidual r =
         ComputeLineResidual(fit, l, T_kf_lidar, Matrix6d::Zero(), config.association);
     if (r.angle_rad > 20.0 * kRadPerDeg) continue;
-    const Eigen::Vector3d apart = T_kf_lidar * fit.cylinder.point - l.cylinder.point;
-    if (std::abs(apart.dot(l.cylinder.axis)) > config.association.max_reach_m) continue;
     if (r.overlap_m < 0.5 * (fit.end_s_m - fit.start_s_m)) continue;
     if (r.offset_m < 0.8 * std::max(r.landmark_radius_m, r.radius_m)) return true;
   }
@@ -807,7 +811,9 @@ void Mapper::Impl::MoveFactors(const std::vector<FactorId>& factors,
 void Mapper::Impl::RefreshLines() {
   const Key pose = PoseKey(num_key_frames - 1);
   T_map_kf = solver.Estimate<Eigen::Isometry3d>(pose);
-  std::vector<std::pair<double, int>> by_distance;
+  // Candidates apart, those first that were seen last: there may be many that never come again, and they
+  // must not push the map, or each other, out of sight.
+  std::vector<std::pair<double, int>> by_distance, candidates;
   for (const LandmarkState& state : map.states()) {
     const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(state.id));
     map.SetLine(state.id, line, state.covariance);
@@ -818,39 +824,79 @@ void Mapper::Impl::RefreshLines() {
     const double s = std::clamp(
         (T_map_kf.translation() - line.point).dot(line.axis), begin, std::max(begin, end));
     const double distance = (line.point + s * line.axis - T_map_kf.translation()).norm();
-    if (distance <= config.nearby_radius_m) by_distance.emplace_back(distance, state.id);
-  }
-  std::sort(by_distance.begin(), by_distance.end());
-  if (static_cast<int>(by_distance.size()) > config.nearby_max) {
-    by_distance.resize(static_cast<std::size_t>(config.nearby_max));
+    if (distance > config.nearby_radius_m) continue;
+    const auto gap = static_cast<double>(scan_number - state.last_scan);
+    if (state.confirmed) {
+      by_distance.emplace_back(distance, state.id);
+    } else {
+      candidates.emplace_back(gap * config.nearby_radius_m + distance, state.id);
+    }
   }
   std::vector<int> ids;
-  for (const auto& [distance, id] : by_distance) ids.push_back(id);
+  for (auto* group : {&by_distance, &candidates}) {
+    std::sort(group->begin(), group->end());
+    if (static_cast<int>(group->size()) > config.nearby_max) {
+      group->resize(static_cast<std::size_t>(config.nearby_max));
+    }
+    for (const auto& [distance, id] : *group) ids.push_back(id);
+  }
   std::sort(ids.begin(), ids.end());
+  // Exact are those that come into reach, and then those that have waited longest. A landmark begun
+  // at this key frame has its fit's covariance, which is relative to it.
+  const int index = num_key_frames - 1;
+  std::map<int, int> last;
+  std::vector<std::pair<int, int>> waiting_since;
+  for (int id : ids) {
+    const auto it = computed_at.find(id);
+    const bool begun = it == computed_at.end() && map.State(id).first_scan == scan_number;
+    last[id] = begun ? index : it == computed_at.end() ? -1 : it->second;
+    if (!begun) waiting_since.emplace_back(last[id], id);
+  }
+  std::sort(waiting_since.begin(), waiting_since.end());
   std::vector<Key> keys;
-  for (int id : ids) keys.push_back(LandmarkKey(id));
+  if (index > 0) keys.push_back(PoseKey(index - 1));
+  for (const auto& [since, id] : waiting_since) {
+    if (since >= 0 && static_cast<int>(keys.size()) > config.nearby_exact) break;
+    keys.push_back(LandmarkKey(id));
+  }
   const std::vector<Eigen::MatrixXd> joints = solver.PairMarginalCovariances(pose, keys);
   kf_covariance = joints.empty() ? Matrix6d(solver.MarginalCovariance(pose))
                                  : Matrix6d(joints.front().topLeftCorner<6, 6>());
+  Matrix6d way = Matrix6d::Zero();  // Covariance of the motion from the key frame before.
+  if (index > 0) {
+    const Eigen::Isometry3d& T_map_before = solver.Estimate<Eigen::Isometry3d>(PoseKey(index - 1));
+    Eigen::Matrix<double, 6, 12> J;
+    J << Matrix6d::Identity(), -AdjointSe3(T_map_kf.inverse() * T_map_before);
+    way = J * joints.front() * J.transpose();
+  }
+  std::map<int, const Eigen::MatrixXd*> exact;
+  for (std::size_t i = index > 0 ? 1 : 0; i < keys.size(); ++i) {
+    exact[static_cast<int>(KeyIndex(keys[i]))] = &joints[i];
+  }
   nearby.clear();
-  for (std::size_t i = 0; i < ids.size(); ++i) {
-    const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(ids[i]));
-    const Eigen::MatrixXd& joint = joints[i];
-    marginals[ids[i]] = joint.bottomRightCorner<5, 5>();
+  for (int id : ids) {
+    const Cylinder& line = solver.Estimate<Cylinder>(LandmarkKey(id));
     // Covariance of the landmark as the key frame sees it: what both drifted together cancels.
     const Cylinder seen = TransformCylinder(T_map_kf.inverse(), line);
     Eigen::Matrix<double, 5, 6> J_pose;
     Matrix5d J_landmark;
     CylinderObservationResidual(seen, T_map_kf, line, &J_pose, &J_landmark);
-    Eigen::Matrix<double, 5, 11> J;
-    J << J_pose, J_landmark;
-    const Matrix5d relative = J * joint * J.transpose();
     const Matrix5d R = CylinderTangentTransform(T_map_kf, seen);
-    map.SetLine(ids[i], line, R * relative * R.transpose());
-    nearby.emplace_back();
-    nearby.back().id = ids[i];
-    RefreshNearby(ids[i]);
+    const auto joint = exact.find(id);
+    if (joint != exact.end()) {
+      marginals[id] = joint->second->bottomRightCorner<5, 5>();
+      Eigen::Matrix<double, 5, 11> J;
+      J << J_pose, J_landmark;
+      const Matrix5d relative = J * *joint->second * J.transpose();
+      map.SetLine(id, line, R * relative * R.transpose());
+      last[id] = index;
+    } else if (last[id] < index) {
+      const Matrix5d grown = J_pose * way * J_pose.transpose();
+      map.SetLine(id, line, map.State(id).covariance + R * grown * R.transpose());
+    }
+    nearby.push_back(TransformLandmark(T_map_kf.inverse(), map.Summary(id)));
   }
+  computed_at = std::move(last);
 }
 
 void Mapper::Impl::RefreshNearby(int id) {

@@ -249,6 +249,7 @@ void TreeMapConfig::Validate() const {
   Require(confirm_radius_sigma_rel > 0.0, "confirm_radius_sigma_rel must be > 0");
   Require(confirm_radius_sigma_m >= 0.0, "confirm_radius_sigma_m must be >= 0");
   Require(candidate_max_gap_scans >= 1, "candidate_max_gap_scans must be >= 1");
+  Require(candidate_gap_per_scan >= 1, "candidate_gap_per_scan must be >= 1");
   Require(max_length_m > 0.0, "max_length_m must be > 0");
   Require(bend_sigma_per_m > 0.0, "bend_sigma_per_m must be > 0");
   Require(coverage_cell_m > 0.0, "coverage_cell_m must be > 0");
@@ -378,7 +379,10 @@ std::vector<int> TreeMap::Promote(std::int64_t scan_number) {
   std::vector<int> drop;
   for (LandmarkState& state : states_) {
     if (state.confirmed) continue;
-    if (scan_number - state.last_scan > config_.candidate_max_gap_scans) {
+    const std::int64_t max_gap =
+        std::min<std::int64_t>(config_.candidate_max_gap_scans,
+                               static_cast<std::int64_t>(config_.candidate_gap_per_scan) * state.num_scans);
+    if (scan_number - state.last_scan > max_gap) {
       drop.push_back(state.id);
       continue;
     }

@@ -1,3 +1,4 @@
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -180,11 +181,24 @@ class TreeMapping : public nodelet::Nodelet {
 
   void Forget() {
     stage_->Reset();
-    if (session_) session_->StartAnew();
+    StartSessionAnew(nullptr);
     last_icp_.reset();
     cloud_join_.emplace(static_cast<std::size_t>(config_.queue_size), CloudJoin::Missing::kDrop);
     latencies_.Reset();
     diagnostics_->ResetCounts();
+  }
+
+  /// What the map goes on from is no longer what the session holds. Where that cannot be kept, mapping
+  /// goes on without a session.
+  void StartSessionAnew(const std::function<void(const std::string&)>& write_base) {
+    if (!session_) return;
+    try {
+      session_->StartAnew(write_base);
+    } catch (const std::exception& error) {
+      session_.reset();
+      diagnostics_->Problem(error.what());
+      NODELET_ERROR("mapping goes on, but a crash would bring the map before it back: %s", error.what());
+    }
   }
 
   void Process(const WaitingScan& scan) {
@@ -221,8 +235,7 @@ class TreeMapping : public nodelet::Nodelet {
     if (!session_->same_run()) {
       // The odometry has begun anew elsewhere: the place must be recognised first.
       const dendro::MapFiles files = stage_->Files(DescribeConfig(config_.stage));
-      session_->StartAnew();
-      dendro::SaveMap(session_->base_directory(), files);
+      StartSessionAnew([&files](const std::string& directory) { dendro::SaveMap(directory, files); });
       stage_->Load(files);
     }
     diagnostics_->Show("scans restored", static_cast<double>(scans));
@@ -325,19 +338,22 @@ class TreeMapping : public nodelet::Nodelet {
     const std::lock_guard<std::mutex> lock(mutex_);
     try {
       const dendro::MapFiles files = dendro::LoadMap(request.directory);
-      stage_->Load(files);
+      // The running map is given up last, when nothing can fail any more.
+      auto loaded = std::make_unique<dendro::TreeMappingStage>(config_.stage);
+      loaded->Load(files);
       if (session_) {
-        session_->StartAnew();
-        dendro::SaveMap(session_->base_directory(), files);
+        session_->StartAnew(
+            [&files](const std::string& directory) { dendro::SaveMap(directory, files); });
       }
+      stage_ = std::move(loaded);
       PublishMap();
       response.success = true;
       response.message = "map of " + std::to_string(stage_->model().branches.size()) +
                          " branches loaded from " + request.directory;
       NODELET_INFO("%s", response.message.c_str());
     } catch (const std::exception& error) {
-      response.message = error.what();
-      NODELET_ERROR("map not loaded: %s", error.what());
+      response.message = std::string("not loaded, the running map stays: ") + error.what();
+      NODELET_ERROR("map %s", response.message.c_str());
     }
     return true;
   }

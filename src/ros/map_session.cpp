@@ -77,8 +77,7 @@ MapSession::MapSession(std::string directory, const std::string& id, bool resume
   same_run_ = known && first == kMagic + id_;
   found_ = same_run_ || (known && resume);
   if (!found_) {
-    MoveAside();
-    Create();
+    StartAnew();
     return;
   }
   // The file goes on behind the last whole record, under the id of this run.
@@ -113,19 +112,7 @@ MapSession::~MapSession() {
 
 bool MapSession::HasBase() const { return fs::exists(base_directory() + "/tree_map.json"); }
 
-void MapSession::Create() {
-  const std::string path = JournalPath();
-  fd_ = ::open(path.c_str(), O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
-  if (fd_ < 0) Fail(path, "cannot be opened");
-  const std::string head = kMagic + id_ + "\n";
-  WriteAll(fd_, head.data(), head.size(), path);
-  end_ = static_cast<std::int64_t>(head.size());
-  broken_ = false;
-}
-
 void MapSession::MoveAside() {
-  if (fd_ >= 0) ::close(fd_);
-  fd_ = -1;
   struct stat info {};
   std::time_t when = std::time(nullptr);
   if (::stat(JournalPath().c_str(), &info) == 0) when = info.st_mtime;
@@ -146,11 +133,39 @@ void MapSession::MoveAside() {
   }
 }
 
-void MapSession::StartAnew() {
-  MoveAside();
-  Create();
+void MapSession::StartAnew(const std::function<void(const std::string& directory)>& write_base) {
+  const fs::path next = fs::path(directory_) / "next";
+  const std::string head = kMagic + id_ + "\n";
+  std::error_code error;
+  int fd = -1;
+  try {
+    fs::remove_all(next, error);  // Of a process that died here.
+    fs::create_directory(next, error);
+    if (error) throw MapSessionError(fmt::format("{}: {}", next.string(), error.message()));
+    if (write_base) write_base((next / "base").string());
+    const std::string journal = (next / "scans.journal").string();
+    fd = ::open(journal.c_str(), O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
+    if (fd < 0) Fail(journal, "cannot be opened");
+    WriteAll(fd, head.data(), head.size(), journal);
+    MoveAside();
+  } catch (...) {
+    if (fd >= 0) ::close(fd);
+    fs::remove_all(next, error);
+    throw;
+  }
+  if (fd_ >= 0) ::close(fd_);
+  fd_ = fd;
+  end_ = static_cast<std::int64_t>(head.size());
+  broken_ = false;
   found_ = false;
   same_run_ = true;
+  // The journal last: without it the next process starts anew.
+  for (const char* name : {"base", "scans.journal"}) {
+    if (!fs::exists(next / name)) continue;
+    fs::rename(next / name, fs::path(directory_) / name, error);
+    if (error) throw MapSessionError(fmt::format("{}/{}: {}", directory_, name, error.message()));
+  }
+  fs::remove(next, error);
 }
 
 std::size_t MapSession::ForEach(

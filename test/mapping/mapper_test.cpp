@@ -206,6 +206,46 @@ TEST(Mapper, FalseDetectionsDoNotEnterTheMap) {
   EXPECT_LE(mapper.Landmarks().size(), MostPieces(world.branches()));
 }
 
+TEST(Mapper, ACrowdOfPassingFitsDoesNotHideTheMap) {
+  // Thirty fits around the sensor that never come again, in every scan: nearer than the tree, and
+  // many more. The tree has to be recognised all the same, or its pieces would be started anew.
+  World world(ThesisLikeTree(), 16);
+  MapperConfig config;
+  config.nearby_max = 50;
+  Mapper mapper(config);
+  DriftingOdometry odometry(&world);
+  std::size_t most = 0;
+  for (int i = 0; i < 300; ++i) {
+    const Eigen::Isometry3d T = CirclePose(0.1 * i, 4.0, 1.0, 1.2, 0.0);
+    MapperInput input;
+    input.stamp_ns = 100000000LL * (i + 1);
+    input.cylinders = world.Scan(T);
+    for (int k = 0; k < 30; ++k) {
+      const Eigen::Vector3d p = T * Eigen::Vector3d(-1.5 + 0.7 * world.Normal(), world.Normal(), 0.0);
+      const Eigen::Vector3d d(world.Normal(), world.Normal(), world.Normal());
+      const TrueBranch ghost{p, p + d, 0.03, 0.03};
+      if (auto fit = world.Observe(ghost, T, 10 + k)) input.cylinders.push_back(*fit);
+    }
+    input.T_odom_lidar = odometry.Next(T);
+    mapper.AddScan(input);
+    most = std::max(most, mapper.Snapshot().landmarks.size());
+  }
+  std::size_t confirmed = 0;
+  for (const LandmarkState& state : mapper.Snapshot().landmarks) confirmed += state.confirmed ? 1 : 0;
+  EXPECT_LE(confirmed, MostPieces(world.branches()));
+  EXPECT_GE(confirmed, 3u);  // Of four: one is out of sight of a level path.
+  EXPECT_GT(most, 200u);  // They were a crowd.
+  EXPECT_LT(most, 1000u);
+}
+
+TEST(Mapper, FewExactCovariancesMapATreeAsWell) {
+  World world(ThesisLikeTree(), 17);
+  MapperConfig config;
+  config.nearby_exact = 2;
+  Mapper mapper(config);
+  ExpectGoodMap(mapper, Fly(&mapper, &world, {}), world, 0.03);
+}
+
 TEST(Mapper, ASecondSessionFindsItselfAndKeepsTheIds) {
   World world(ThesisLikeTree(), 11);
   Mapper first;

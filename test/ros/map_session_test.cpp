@@ -4,6 +4,7 @@
 
 #include <filesystem>
 #include <fstream>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -125,6 +126,34 @@ TEST_F(MapSessionTest, StartingAnewKeepsTheOld) {
   EXPECT_EQ(Read(session), std::vector<std::int64_t>{2});
   session.StartAnew();
   EXPECT_EQ(Earlier(), 2U);
+}
+
+TEST_F(MapSessionTest, StartsOnALoadedMapOrStaysAsItWas) {
+  MapSession session(Path(), "run", false);
+  session.Append(Scan(1));
+  EXPECT_FALSE(session.HasBase());
+  // The disk is full halfway.
+  EXPECT_THROW(session.StartAnew([](const std::string& directory) {
+    fs::create_directories(directory);
+    std::ofstream(directory + "/cylinders.csv") << "id";
+    throw std::runtime_error("no space left on device");
+  }),
+               std::runtime_error);
+  EXPECT_EQ(Earlier(), 0U);
+  EXPECT_FALSE(session.HasBase());
+  session.Append(Scan(2));
+  EXPECT_EQ(Read(MapSession(Path(), "run", false)), (std::vector<std::int64_t>{1, 2}));
+
+  session.StartAnew([](const std::string& directory) {
+    fs::create_directories(directory);
+    std::ofstream(directory + "/tree_map.json") << "{}";
+  });
+  EXPECT_EQ(Earlier(), 1U);
+  session.Append(Scan(3));
+  const MapSession next(Path(), "run", false);
+  EXPECT_TRUE(next.HasBase());
+  EXPECT_TRUE(next.same_run());
+  EXPECT_EQ(Read(next), std::vector<std::int64_t>{3});
 }
 
 TEST_F(MapSessionTest, SaysWhatCannotBeWritten) {

@@ -65,7 +65,10 @@ struct MapperConfig {
                                         ///< the surface seen returned from it: several twigs, no branch. In [0, 1).
   double column_step_deg = 0.2;         ///< Of the lidar, for that: between two beams of one ring [deg]. > 0.
   double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
-  int nearby_max = 48;                  ///< Nor more than the nearest ones. >= 1.
+  int nearby_max = 150;                 ///< Nor more than so many of the nearest in the map, and so many of
+                                        ///< the nearest candidates. >= 1.
+  int nearby_exact = 48;                ///< Covariances computed anew at a key frame; those of the others grow
+                                        ///< by what is not known of the way between, and come next. >= 1.
   double min_radius_m = 0.003;          ///< Thinner fits are not mapped [m]. > 0.
   double max_radius_sigma_rel = 0.5;    ///< Fits that know their radius worse are not mapped. > 0.
 
@@ -122,6 +125,7 @@ struct MapperConfig {
     v("column_step_deg", column_step_deg);
     v("nearby_radius_m", nearby_radius_m);
     v("nearby_max", nearby_max);
+    v("nearby_exact", nearby_exact);
     v("min_radius_m", min_radius_m);
     v("max_radius_sigma_rel", max_radius_sigma_rel);
     v("relocalize_axis_deg", relocalize_axis_deg);

@@ -22,6 +22,8 @@ struct TreeMapConfig {
   double confirm_radius_sigma_rel = 0.35;  ///< And its radius is known to this part of it. > 0.
   double confirm_radius_sigma_m = 0.004;   ///< Or to this: a twig is known by where it is [m]. >= 0.
   int candidate_max_gap_scans = 300; ///< A candidate not seen for longer is dropped. >= 1.
+  int candidate_gap_per_scan = 100;  ///< And one not seen for longer than this for every scan that saw it:
+                                     ///< most are fits that never come again. >= 1.
   double max_length_m = 2.0;         ///< A landmark is not extended beyond this: trunks and branches bend,
                                      ///< and are mapped as a chain of straight pieces [m]. > 0.
   double bend_sigma_per_m = 0.15;    ///< Prior of a landmark's bend (second derivative of its axis), in
@@ -56,6 +58,7 @@ struct TreeMapConfig {
     v("confirm_radius_sigma_rel", confirm_radius_sigma_rel);
     v("confirm_radius_sigma_m", confirm_radius_sigma_m);
     v("candidate_max_gap_scans", candidate_max_gap_scans);
+    v("candidate_gap_per_scan", candidate_gap_per_scan);
     v("max_length_m", max_length_m);
     v("bend_sigma_per_m", bend_sigma_per_m);
     v("coverage_cell_m", coverage_cell_m);

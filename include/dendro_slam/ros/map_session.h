@@ -56,13 +56,14 @@ class MapSession {
   ///                          not follow on what is there.
   void Append(const dendro_slam::MappedScan& scan);
 
-  /// The map starts anew: what is there is moved aside.
-  /// @throws MapSessionError
-  void StartAnew();
+  /// The map starts anew: what is there is moved aside once all that takes its place is on the disk.
+  /// @param write_base  Writes the map that the session starts on into the folder that it is given;
+  ///                    none: the session starts on no map.
+  /// @throws MapSessionError, and what the callback throws; the session then is as it was.
+  void StartAnew(const std::function<void(const std::string& directory)>& write_base = nullptr);
 
  private:
   std::string JournalPath() const { return directory_ + "/scans.journal"; }
-  void Create();
   void MoveAside();
 
   std::string directory_;
