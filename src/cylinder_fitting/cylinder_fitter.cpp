@@ -41,6 +41,9 @@ constexpr double kShortest = 4.0;  // Length over radius.
 constexpr float kLongSight_s = 0.02F;
 // Sine of the angle to the axis from which two neighbours see the silhouette and not an end.
 constexpr double kLeastCrossing = 0.25;
+// Rings lie ten times as far apart as columns. Where columns see the silhouette, a neighbour in another
+// ring only repeats what limb and miss have told already, as if it were news.
+constexpr double kLeastCrossingOfRings = 0.968;  // sqrt(1 - kLeastCrossing^2)
 // Returns at the sensor and beyond this are none, nor are beams that start there [m].
 constexpr double kNearest = 1e-3;
 constexpr float kFarthest = 1e3F;
@@ -72,6 +75,7 @@ struct Beam {
 struct Edge {
   Beam hit, miss;
   double competing = 0.0;  // See DetectionOffset.
+  bool across_rings = false;
 };
 
 // A linear observation `low <= g . x <= high` of the state, whose ends are known to sigma.
@@ -321,17 +325,25 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
   if (next_row < 0 || next_row >= image_.rows) return;
   const std::size_t next = image_.Index(next_row, image_.WrapColumn(col + d_col));
   if (InSegment(next)) return;
-  const int beyond_row = row + 2 * d_row;
-  if (beyond_row >= 0 && beyond_row < image_.rows &&
-      InSegment(image_.Index(beyond_row, image_.WrapColumn(col + 2 * d_col)))) {
-    return;  // A hole, not an edge.
-  }
+  // A pixel between pixels of the segment is a hole, from whichever side it is come to.
+  const auto between = [&](int step_row, int step_col) {
+    for (const int way : {-1, 1}) {
+      const int other_row = next_row + way * step_row;
+      if (other_row < 0 || other_row >= image_.rows ||
+          !InSegment(image_.Index(other_row, image_.WrapColumn(col + d_col + way * step_col)))) {
+        return false;
+      }
+    }
+    return true;
+  };
+  if (between(0, 1) || between(1, 0)) return;
   if (!IsBeam(next)) return;
   const double range =
       static_cast<double>((image_.point[pixel] - image_.beam_origin[pixel]).norm());
   Edge edge;
   edge.hit = BeamAt(pixel, range);
   edge.miss = BeamAt(next, range);
+  edge.across_rings = d_row != 0;
   if (image_.HasReturn(next)) {
     const double behind =
         static_cast<double>((image_.point[next] - image_.beam_origin[next]).norm());
@@ -497,10 +509,12 @@ void SegmentFit::Linearise(Estimate* estimate,
   estimate->residuals.assign(n, 0.0);
   estimate->weights.assign(n, 0.0);
   std::vector<double> magnitudes;
+  std::vector<double> stations(n);
   for (std::size_t i = 0; i < n; ++i) {
     const Beam& beam = beams_[i];
     BentCone::TouchJacobian touching;
-    const Cone cone = bent.Touching(bent.StationOf(beam.origin, beam.direction), &touching);
+    stations[i] = bent.StationOf(beam.origin, beam.direction);
+    const Cone cone = bent.Touching(stations[i], &touching);
     const BeamOnCone located = LocateBeam(cone, beam.origin, beam.direction);
     if (!located.valid) continue;
     const RangePrediction predicted = PredictRange(located, FootprintOf(cone, beam));
@@ -515,9 +529,14 @@ void SegmentFit::Linearise(Estimate* estimate,
   double sum = config_.range_sigma_weight * config_.range_sigma_m * config_.range_sigma_m;
   double count = config_.range_sigma_weight;
   double used = 0.0;
+  double first_station = std::numeric_limits<double>::infinity(), last_station = -first_station;
   for (std::size_t i = 0; i < n; ++i) {
     if (estimate->weights[i] == 0.0) continue;
     const double w = RobustWeight(estimate->residuals[i] / scale);
+    if (w >= 0.5) {
+      first_station = std::min(first_station, stations[i]);
+      last_station = std::max(last_station, stations[i]);
+    }
     estimate->weights[i] = w;
     sum += w * estimate->residuals[i] * estimate->residuals[i];
     used += w;
@@ -587,7 +606,12 @@ void SegmentFit::Linearise(Estimate* estimate,
     const double width = side * (miss.offset - hit.offset);
     // Only neighbours across the axis see the silhouette; one along it sees an end.
     const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
-    if (width < kLeastCrossing * apart || side * miss.offset < 0.0) continue;
+    const double least = edge.across_rings ? kLeastCrossingOfRings : kLeastCrossing;
+    if (width < least * apart || side * miss.offset < 0.0) continue;
+    // Beyond the stretch that is seen, a beam may miss because the branch ends there.
+    const double spacing = edge.hit.range * 2.0 * M_PI / image_.cols;
+    const double beyond = bent.StationOf(edge.miss.origin, edge.miss.direction);
+    if (beyond < first_station - spacing || beyond > last_station + spacing) continue;
     double hit_Y = 1.0, miss_Y = 1.0;
     const Footprint footprint = FootprintOf(cone, edge.hit);
     const double beam_width = std::max(2.0 * footprint.half_width_m, kThinnestBeam);

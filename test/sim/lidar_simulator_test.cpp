@@ -1,9 +1,12 @@
 #include "dendro_slam/sim/lidar_simulator.h"
 
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
 #include <functional>
+#include <stdexcept>
+#include <vector>
 
 #include <gtest/gtest.h>
 
@@ -117,6 +120,42 @@ TEST(LidarSimulator, RangeNoiseHasItsSigmaAndQuantisationItsStep) {
   const double n = static_cast<double>(out.scan.points.size());
   EXPECT_NEAR(sum / n, 0.0, 4 * 0.01 / std::sqrt(n));
   EXPECT_NEAR(std::sqrt(square / n), std::hypot(0.01, 0.002 / std::sqrt(12.0)), 3e-4);
+}
+
+// The thesis' noise: every error within +-3 cm equally likely, none beyond; beside the gaussian one
+// where both are set.
+TEST(LidarSimulator, EvenNoiseIsEvenAndBounded) {
+  Scene scene = EmptyScene();
+  scene.obstacles.push_back(Wall(5.0, -50.0, 50.0));
+  const Raycaster raycaster(scene);
+  LidarSimulatorConfig config = Ideal();
+  config.enable_range_noise = true;
+  config.range_uniform_m = 0.03;
+  const auto errors = [&](double sigma) {
+    config.range_sigma_m = sigma;
+    const SimulatedScan out = LidarSimulator(raycaster, config).SimulateScan(0, Eigen::Isometry3d::Identity());
+    std::vector<double> e;
+    for (std::size_t i = 0; i < out.scan.points.size(); ++i) {
+      const Eigen::Vector3d p = out.scan.points[i].position.cast<double>() -
+                                Eigen::Vector3d(0, 0, vlp16::RingVerticalOffsetM(out.scan.points[i].ring));
+      e.push_back(p.norm() - static_cast<double>(out.truth[i].thin_range_m));
+    }
+    return e;
+  };
+  const std::vector<double> even = errors(0.0);
+  const double n = static_cast<double>(even.size());
+  ASSERT_GT(n, 12000);
+  int part[6] = {};
+  for (const double e : even) {
+    ASSERT_LE(std::abs(e), 0.03 + 1e-5);
+    ++part[std::min(5, std::max(0, static_cast<int>((e + 0.03) / 0.01)))];
+  }
+  for (const int count : part) EXPECT_NEAR(count, n / 6.0, 4.0 * std::sqrt(n * 5.0 / 36.0));
+  double square = 0.0;
+  for (const double e : errors(0.01)) square += e * e;
+  EXPECT_NEAR(std::sqrt(square / n), std::hypot(0.01, 0.03 / std::sqrt(3.0)), 4e-4);
+  config.range_uniform_m = -0.01;
+  EXPECT_THROW(config.Validate(), std::invalid_argument);
 }
 
 TEST(LidarSimulator, EdgeOfAPlateBlursOverTheFootprint) {
