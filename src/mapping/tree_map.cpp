@@ -218,7 +218,10 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       const bool a_within = rest_a < std::max(kMinRestM, kMinRest * length(a));
       const bool b_within = rest_b < std::max(kMinRestM, kMinRest * length(b));
       if (a_within || b_within) {
-        dropped[length(a) < length(b) ? i : j] = true;
+        // The shorter one, unless the longer one was hardly seen and most of it is over the same stretch.
+        const bool a_less_seen = a.num_scans < b.num_scans;
+        const bool drop_less_seen = hardly_seen && end - begin > 0.5 * length(a_less_seen ? a : b);
+        dropped[(drop_less_seen ? a_less_seen : length(a) < length(b)) ? i : j] = true;
         continue;
       }
       const double cut_b = std::clamp(s_b, b.s_min_m, b.s_max_m);

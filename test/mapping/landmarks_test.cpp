@@ -426,6 +426,12 @@ TEST(SeparatePieces, DropsAThinPieceInsideAThickOneAndKeepsABranchThatLeavesIt) 
   // Nearly as thick, but hardly ever seen: it does not cut the stem either. Seen often, it goes on with it.
   EXPECT_EQ(SeparatePieces({stem, piece(1, {-0.07, -0.05, 1}, {-0.06, 0.02, 2.5}, 0.15, 18)}).size(), 1u);
   EXPECT_EQ(SeparatePieces({stem, piece(1, {0, 0, 1.4}, {0, 0, 2.6}, 0.17, 100)}).size(), 2u);
+  // Two over the same stretch: the well seen one stays, and with it the branch's id, though it is shorter.
+  const std::vector<Landmark> same =
+      SeparatePieces({piece(5, {-0.53, 0.36, 3.06}, {-1.03, 0.23, 4.03}, 0.0171, 439),
+                      piece(37, {-0.37, 0.36, 2.84}, {-0.98, 0.26, 3.90}, 0.0254, 11)});
+  ASSERT_EQ(same.size(), 1u);
+  EXPECT_EQ(same[0].id, 5);
 }
 
 TEST(LevelFactors, JacobiansMatchCentralDifferences) {
