@@ -148,6 +148,27 @@ void Clip(double begin, double end, Landmark* landmark) {
   landmark->s_max_m = end - middle;
 }
 
+// True when `piece` runs close beside `other` over its whole length and was seen by next to none of the
+// scans that saw the other, though it is not thinner: fits laid across two neighbours, no wood. Wood there
+// would have been seen as often.
+bool IsPhantomBeside(const Landmark& piece, const Landmark& other) {
+  constexpr double kMaxAngleDeg = 35.0;
+  constexpr double kMaxApartM = 0.25;
+  constexpr double kThinnest = 0.75;  // Of the other's radius.
+  constexpr int kFewerScans = 20;
+  if (kFewerScans * piece.num_scans > other.num_scans) return false;
+  if (piece.cylinder.radius() < kThinnest * other.cylinder.radius()) return false;
+  if (std::abs(piece.cylinder.axis.dot(other.cylinder.axis)) < std::cos(kMaxAngleDeg * kRadPerDeg)) {
+    return false;
+  }
+  for (const double s : {piece.s_min_m, piece.s_max_m}) {
+    const Eigen::Vector3d p = piece.PointAt(s);
+    const double t = (p - other.cylinder.point).dot(other.cylinder.axis);
+    if (t < other.s_min_m || t > other.s_max_m || (p - other.PointAt(t)).norm() > kMaxApartM) return false;
+  }
+  return true;
+}
+
 }  // namespace
 
 std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
@@ -184,6 +205,10 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
       if (dropped[j]) continue;
       Landmark& a = landmarks[i];
       Landmark& b = landmarks[j];
+      if (IsPhantomBeside(a, b) || IsPhantomBeside(b, a)) {
+        dropped[a.num_scans < b.num_scans ? i : j] = true;
+        continue;
+      }
       if (std::abs(a.cylinder.axis.dot(b.cylinder.axis)) < std::cos(kMaxAngleDeg * kRadPerDeg)) {
         continue;
       }

@@ -237,6 +237,21 @@ TEST(TreeMap, WhatWasSeenFromAllAroundIsMapHoweverSeldom) {
   EXPECT_FALSE(confirmed(12, 2.0 * M_PI));
 }
 
+TEST(TreeMap, WhatHardlyAScanSawBesideAWellSeenBranchIsNotMap) {
+  const auto seen = [](Landmark l, int scans) {
+    l.num_scans = scans;
+    return l;
+  };
+  const Landmark branch = seen(Known(0, {0, 0, 0}, {0, 0, 1}, 1.0, 0.05), 370);
+  // Fits across it and its neighbour, 12 cm beside it and 15 degrees off.
+  const Eigen::Vector3d off(0.26, 0, 0.97);
+  EXPECT_EQ(SeparatePieces({branch, seen(Known(1, {0.12, 0, 0}, off, 0.3, 0.045), 13)}).size(), 1u);
+  // As often seen, it is a neighbour; thin, a twig; beyond the branch's end, its tip.
+  EXPECT_EQ(SeparatePieces({branch, seen(Known(1, {0.12, 0, 0}, off, 0.3, 0.045), 100)}).size(), 2u);
+  EXPECT_EQ(SeparatePieces({branch, seen(Known(1, {0.12, 0, 0}, off, 0.3, 0.01), 13)}).size(), 2u);
+  EXPECT_EQ(SeparatePieces({branch, seen(Known(1, {0.05, 0, 1.35}, off, 0.3, 0.045), 13)}).size(), 2u);
+}
+
 TEST(Relocalizer, FindsAnyPoseAndRefusesASymmetricScene) {
   const std::vector<Landmark> loaded{Known(4, {0, 0, 2}, {0, 0, 1}, 2.0, 0.2),
                                      Known(5, {0.8, 0.2, 2.5}, {0.8, 0.2, 0.5}, 0.6, 0.08),

@@ -23,7 +23,7 @@ struct TopologyConfig {
   double join_gap_m = 1.0;            ///< Longest unseen gap that one branch may bridge [m]. >= 0.
   double join_angle_deg = 30.0;       ///< Largest bend between two pieces of one branch [deg].
   double join_elbow_deg = 60.0;       ///< The same where they meet and are equally thick [deg].
-  double join_offset_m = 0.06;        ///< Sideways miss allowed beside radius and bend [m]. >= 0.
+  double join_offset_m = 0.09;        ///< Sideways miss allowed beside radius and bend [m]. >= 0.
   double join_radius_ratio = 1.8;     ///< Largest step of the radius at a joint. > 1.
   double attach_reach_m = 1.0;       ///< Farthest from a parent's surface a base may end [m]. >= 0.
   double attach_offset_m = 0.08;     ///< Sideways miss of the parent's surface allowed [m]. >= 0.
