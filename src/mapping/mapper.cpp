@@ -130,6 +130,8 @@ void MapperConfig::Validate() const {
   Require(observation_scale > 0.0, "observation_scale must be > 0");
   Require(observation_axis_floor_deg >= 0.0, "observation_axis_floor_deg must be >= 0");
   Require(observation_offset_floor_m >= 0.0, "observation_offset_floor_m must be >= 0");
+  Require(observation_axis_shared_deg >= 0.0, "observation_axis_shared_deg must be >= 0");
+  Require(observation_offset_shared_m >= 0.0, "observation_offset_shared_m must be >= 0");
   Require(robust_width > 0.0, "robust_width must be > 0");
   Require(min_fill >= 0.0 && min_fill < 1.0, "min_fill must be in [0, 1)");
   Require(column_step_deg > 0.0, "column_step_deg must be > 0");
@@ -386,9 +388,9 @@ void Mapper::Impl::Evaluate(const std::vector<FittedCylinder>& cylinders, Hypoth
   std::vector<const Landmark*> landmarks;
   landmarks.reserve(nearby.size());
   for (const Landmark& l : nearby) landmarks.push_back(&l);
-  DataAssociationConfig no_floor = config.association;
-  no_floor.axis_sigma_floor_deg = 0.0;
-  no_floor.offset_sigma_floor_m = 0.0;
+  DataAssociationConfig as_in_graph = config.association;
+  as_in_graph.axis_sigma_floor_deg = config.observation_axis_shared_deg;
+  as_in_graph.offset_sigma_floor_m = config.observation_offset_shared_m;
 
   Eigen::Isometry3d T = h->kf_now.T;
   Matrix6d P = h->kf_now.covariance;
@@ -408,7 +410,7 @@ void Mapper::Impl::Evaluate(const std::vector<FittedCylinder>& cylinders, Hypoth
         const FittedCylinder fit =
             Conditioned(cylinders[static_cast<std::size_t>(match.observation)], l, refined);
         const LineResidual r =
-            ComputeLineResidual(fit, l, refined, Matrix6d::Zero(), no_floor);
+            ComputeLineResidual(fit, l, refined, Matrix6d::Zero(), as_in_graph);
         const Eigen::Matrix4d W = r.covariance.ldlt().solve(Eigen::Matrix4d::Identity());
         const double norm = std::sqrt(std::max(0.0, r.residual.dot(W * r.residual)));
         const double weight = norm > config.robust_width ? config.robust_width / norm : 1.0;
@@ -507,10 +509,15 @@ FactorPtr Mapper::Impl::ObservationFactor(int key_frame,
                            .dot(summary.cylinder.axis);
   const double shift = 1.0 / summary.RadiusAt(s_variable) - 1.0 / summary.RadiusAt(s_fit);
   if (conditioned.cylinder.curvature + shift > 0.0) conditioned.cylinder.curvature += shift;
+  Matrix5d covariance = conditioned.covariance;
+  const double axis_shared = config.observation_axis_shared_deg * kRadPerDeg;
+  covariance.diagonal().head<2>().array() += axis_shared * axis_shared;
+  covariance.diagonal().segment<2>(2).array() +=
+      config.observation_offset_shared_m * config.observation_offset_shared_m;
   return std::make_shared<CylinderFactor>(PoseKey(key_frame),
                                           LandmarkKey(id),
                                           conditioned.cylinder,
-                                          conditioned.covariance,
+                                          covariance,
                                           CylinderParts{},
                                           RobustKernel::Huber(config.robust_width));
 }

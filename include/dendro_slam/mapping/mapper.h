@@ -59,6 +59,11 @@ struct MapperConfig {
   double observation_scale = 1.5;       ///< The fits' sigmas are multiplied by this. > 0.
   double observation_axis_floor_deg = 0.5;  ///< Added to the axis' sigma [deg]: branches bend. >= 0.
   double observation_offset_floor_m = 0.002;  ///< Added to the line's sigma [m]. >= 0.
+  // What the scans of one landmark have in common (it bends, its bark is uneven, all see the same side) does
+  // not average out: taken for independent, the axes of a trunk that leans by a few degrees are a compass
+  // that turns the map. So a factor of the graph carries more than the error of one scan.
+  double observation_axis_shared_deg = 1.0;    ///< Added to the axis' sigma in the graph [deg]. >= 0.
+  double observation_offset_shared_m = 0.004;  ///< Added to the line's sigma in the graph [m]. >= 0.
   double robust_width = 1.5;            ///< Cylinder factors: residuals beyond this many sigmas lose
                                         ///< weight (Huber). > 0.
   double min_fill = 0.65;               ///< A fit is not mapped when fewer of the beams that should have met
@@ -120,6 +125,8 @@ struct MapperConfig {
     v("observation_scale", observation_scale);
     v("observation_axis_floor_deg", observation_axis_floor_deg);
     v("observation_offset_floor_m", observation_offset_floor_m);
+    v("observation_axis_shared_deg", observation_axis_shared_deg);
+    v("observation_offset_shared_m", observation_offset_shared_m);
     v("robust_width", robust_width);
     v("min_fill", min_fill);
     v("column_step_deg", column_step_deg);
