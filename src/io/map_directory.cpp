@@ -290,15 +290,6 @@ Json BranchJson(const MapBranch& b) {
           {"height_m", finite(b.height_m)}};
 }
 
-Json GroundPatchJson(const std::pair<int, int>& cell, const GroundSurface::Patch& patch) {
-  const auto finite = [&](double v) { return Finite(v, "a number of the ground at", cell.first); };
-  return {{"cell", {cell.first, cell.second}},
-          {"count", patch.count},
-          {"foot", {finite(patch.foot.x()), finite(patch.foot.y())}},
-          {"z_m", finite(patch.z_m)},
-          {"slope", {finite(patch.slope.x()), finite(patch.slope.y())}}};
-}
-
 Json TreeJson(const MapTree& t) {
   const auto finite = [&](double v) { return Finite(v, "a number of tree", t.id); };
   Json crown = nullptr;
@@ -470,26 +461,6 @@ class Reader {
   const std::string& file_;
   std::string path_;
 };
-
-GroundSurface::Patches ReadGroundPatches(const Reader& list) {
-  GroundSurface::Patches patches;
-  const std::size_t size = list.ArraySize();
-  for (std::size_t i = 0; i < size; ++i) {
-    const Reader j = list.At(i);
-    const std::vector<int> cell = j["cell"].Ints();
-    j["cell"].RequireSize(2);
-    j["foot"].RequireSize(2);
-    j["slope"].RequireSize(2);
-    GroundSurface::Patch patch;
-    patch.count = j["count"].Int();
-    if (patch.count < 1) j["count"].Fail("is not positive");
-    patch.foot = {j["foot"].At(0).Double(), j["foot"].At(1).Double()};
-    patch.z_m = j["z_m"].Double();
-    patch.slope = {j["slope"].At(0).Double(), j["slope"].At(1).Double()};
-    if (!patches.emplace(std::pair(cell[0], cell[1]), patch).second) j["cell"].Fail("is used twice");
-  }
-  return patches;
-}
 
 Matrix5d ReadUpperTriangle(const Reader& j) {
   j.RequireSize(15);
@@ -1043,10 +1014,6 @@ std::string TreeMapJson(const MapFiles& files) {
   j["topology"] = TopologyJson(files.topology);
   j["upright"] = files.snapshot.upright;
   if (files.snapshot.ground) j["ground"] = VecJson(*files.snapshot.ground, "the ground", 0);
-  j["ground_patches"] = Json::array();
-  for (const auto& [cell, patch] : files.ground) {
-    j["ground_patches"].push_back(GroundPatchJson(cell, patch));
-  }
   j["next_landmark_state_id"] = files.snapshot.next_landmark_id;
   j["landmark_states"] = Json::array();
   for (const LandmarkState& state : files.snapshot.landmarks) {
@@ -1152,8 +1119,6 @@ MapFiles LoadMap(const std::string& directory) {
   files.topology = ReadTopology(j["topology"]);
   files.snapshot.upright = j["upright"].Bool();
   if (j.Has("ground")) files.snapshot.ground = j["ground"].Vector();
-  // Maps of before stand on the lowest wood seen until the ground is seen again.
-  if (j.Has("ground_patches")) files.ground = ReadGroundPatches(j["ground_patches"]);
   files.snapshot.next_landmark_id = j["next_landmark_state_id"].NonNegative();
   read_list("landmark_states", ReadLandmarkState, &files.snapshot.landmarks);
   // Last, so that a field that is wrong is named; absent from maps of before.

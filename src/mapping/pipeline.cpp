@@ -161,7 +161,6 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   files.snapshot = mapper_.Snapshot();
   files.next_landmark_id = files.snapshot.next_landmark_id;
   files.topology = topology_.state();
-  files.ground = ground_.patches();
   files.config = config;
   files.georeference = georeferencer_.Solve(files.trajectory);
   const bool loaded_is_better =
@@ -180,7 +179,7 @@ void TreeMappingStage::Load(const MapFiles& files) {
   georeferencer_.Clear();
   loaded_georeference_ = files.georeference;
   cloud_.Restore(files.points);
-  ground_.set_patches(files.ground);
+  ground_.Clear();
   model_ = BuildModel(files.model.stamp_ns);
 }
 

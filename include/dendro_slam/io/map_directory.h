@@ -13,7 +13,6 @@
 #include "dendro_slam/branch_separation/segment.h"
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/io/stage_timer.h"
-#include "dendro_slam/mapping/ground_surface.h"
 #include "dendro_slam/mapping/georeference.h"
 #include "dendro_slam/mapping/landmark.h"
 #include "dendro_slam/mapping/mapper.h"
@@ -39,7 +38,6 @@ struct MapFiles {
                                     ///< tree_map.json holds it complete (every LandmarkState).
   int next_landmark_id = 0;
   TopologyState topology;
-  GroundSurface::Patches ground;    ///< The ground below the trees.
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.
   std::vector<CloudPoint> points;       ///< Empty unless they were gathered (MapCloud).
   std::string frame = "map";

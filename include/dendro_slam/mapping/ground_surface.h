@@ -25,15 +25,6 @@ struct GroundLevel {
 /// Cost: a look-up per scan, memory of 60 bytes per square metre walked. Same input, same bytes.
 class GroundSurface {
  public:
-  /// Sums over the scans taken in one cell. Plain data, for files.
-  struct Patch {
-    int count = 0;                                    ///< > 0.
-    Eigen::Vector2d foot = Eigen::Vector2d::Zero();   ///< Below the lidar.
-    double z_m = 0.0;                                 ///< Of the plane there.
-    Eigen::Vector2d slope = Eigen::Vector2d::Zero();  ///< dz/dx, dz/dy.
-  };
-  using Patches = std::map<std::pair<int, int>, Patch>;  ///< By cell: x, y in whole metres.
-
   /// Takes the ground of one scan. Left out: planes that lean by more than 26 degrees in the map (a
   /// bank, or the map is not upright), and those seen from more than 5 m above (only far ground is).
   /// @param ground  In the lidar frame.
@@ -45,11 +36,15 @@ class GroundSurface {
 
   void Clear() { patches_.clear(); }
 
-  const Patches& patches() const { return patches_; }
-  void set_patches(Patches patches) { patches_ = std::move(patches); }
-
  private:
-  Patches patches_;
+  /// Sums over the scans taken in one cell.
+  struct Patch {
+    int count = 0;
+    Eigen::Vector2d foot = Eigen::Vector2d::Zero();   ///< Below the lidar.
+    double z_m = 0.0;                                 ///< Of the plane there.
+    Eigen::Vector2d slope = Eigen::Vector2d::Zero();  ///< dz/dx, dz/dy.
+  };
+  std::map<std::pair<int, int>, Patch> patches_;
 };
 
 }  // namespace dendro
