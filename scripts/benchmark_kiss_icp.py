@@ -90,8 +90,8 @@ def main():
     parser.add_argument("bag", metavar="BAG")
     parser.add_argument("--truth", help="default: NAME.truth beside the bag")
     parser.add_argument("--map", metavar="MAP_DIR", help="score this map's path beside it")
-    parser.add_argument("--voxel", type=float, default=0.25, metavar="M",
-                        help="voxel size of KISS-ICP's map [m] (default %(default)s)")
+    parser.add_argument("--voxel", type=float, default=1.0, metavar="M",
+                        help="voxel size of KISS-ICP's map [m] (default %(default)s, KISS-ICP's own)")
     arguments = parser.parse_args()
     truth = Truth(arguments.truth or os.path.splitext(arguments.bag)[0] + ".truth").trajectory
     if not truth:

@@ -270,6 +270,14 @@ Json GeoreferenceJson(const Georeference& g) {
           {"note", g.note}};
 }
 
+Json GroundPatchJson(const GroundPatch& patch) {
+  const auto finite = [](double v) { return Finite(v, "a number of the ground", 0); };
+  return {{"count", patch.count},
+          {"foot", {finite(patch.foot.x()), finite(patch.foot.y())}},
+          {"z_m", finite(patch.z_m)},
+          {"slope", {finite(patch.slope.x()), finite(patch.slope.y())}}};
+}
+
 Json BranchJson(const MapBranch& b) {
   const auto finite = [&](double v) { return Finite(v, "a number of branch", b.id); };
   return {{"id", b.id},
@@ -1014,6 +1022,8 @@ std::string TreeMapJson(const MapFiles& files) {
   j["topology"] = TopologyJson(files.topology);
   j["upright"] = files.snapshot.upright;
   if (files.snapshot.ground) j["ground"] = VecJson(*files.snapshot.ground, "the ground", 0);
+  j["ground_patches"] = Json::array();
+  for (const GroundPatch& patch : files.ground) j["ground_patches"].push_back(GroundPatchJson(patch));
   j["next_landmark_state_id"] = files.snapshot.next_landmark_id;
   j["landmark_states"] = Json::array();
   for (const LandmarkState& state : files.snapshot.landmarks) {
@@ -1119,6 +1129,24 @@ MapFiles LoadMap(const std::string& directory) {
   files.topology = ReadTopology(j["topology"]);
   files.snapshot.upright = j["upright"].Bool();
   if (j.Has("ground")) files.snapshot.ground = j["ground"].Vector();
+  // Absent from maps of before.
+  if (j.Has("ground_patches")) {
+    const Reader patches = j["ground_patches"];
+    for (std::size_t i = 0; i < patches.ArraySize(); ++i) {
+      const Reader patch = patches.At(i);
+      patch["foot"].RequireSize(2);
+      patch["slope"].RequireSize(2);
+      GroundPatch read;
+      read.count = patch["count"].Int();
+      if (read.count < 1) patch["count"].Fail("is not positive");
+      read.foot = {patch["foot"].At(0).Double(), patch["foot"].At(1).Double()};
+      read.z_m = patch["z_m"].Double();
+      read.slope = {patch["slope"].At(0).Double(), patch["slope"].At(1).Double()};
+      // Within the range of the cells' indices.
+      if (read.foot.cwiseAbs().maxCoeff() > 1e9) patch["foot"].Fail("is out of range");
+      files.ground.push_back(read);
+    }
+  }
   files.snapshot.next_landmark_id = j["next_landmark_state_id"].NonNegative();
   read_list("landmark_states", ReadLandmarkState, &files.snapshot.landmarks);
   // Last, so that a field that is wrong is named; absent from maps of before.

@@ -15,6 +15,10 @@ constexpr double kHalfWeightM = 3.0;
 // What all planes may be wrong by together: pose and mounting height, grass.
 constexpr double kFloorM = 0.02;
 
+std::pair<int, int> CellOf(const Eigen::Vector2d& foot) {
+  return {static_cast<int>(std::floor(foot.x() / kCellM)), static_cast<int>(std::floor(foot.y() / kCellM))};
+}
+
 }  // namespace
 
 void GroundSurface::Add(const GroundPlane& ground, const Eigen::Isometry3d& T_map_lidar) {
@@ -22,12 +26,31 @@ void GroundSurface::Add(const GroundPlane& ground, const Eigen::Isometry3d& T_ma
   const Eigen::Vector3d lidar = T_map_lidar.translation();
   if (!(normal.z() >= kMinUp) || !(ground.offset <= kMaxHeightM) || !lidar.allFinite()) return;
   const Eigen::Vector2d foot = lidar.head<2>();
-  Patch& patch = patches_[{static_cast<int>(std::floor(foot.x() / kCellM)),
-                           static_cast<int>(std::floor(foot.y() / kCellM))}];
+  Patch& patch = patches_[CellOf(foot)];
   ++patch.count;
   patch.foot += foot;
   patch.z_m += lidar.z() - ground.offset / normal.z();
   patch.slope -= normal.head<2>() / normal.z();
+}
+
+std::vector<GroundPatch> GroundSurface::Patches() const {
+  std::vector<GroundPatch> out;
+  for (const auto& [cell, patch] : patches_) {
+    const double share = 1.0 / patch.count;
+    out.push_back({patch.count, share * patch.foot, share * patch.z_m, share * patch.slope});
+  }
+  return out;
+}
+
+void GroundSurface::Restore(const std::vector<GroundPatch>& patches) {
+  patches_.clear();
+  for (const GroundPatch& mean : patches) {
+    Patch& patch = patches_[CellOf(mean.foot)];
+    patch.count += mean.count;
+    patch.foot += mean.count * mean.foot;
+    patch.z_m += mean.count * mean.z_m;
+    patch.slope += mean.count * mean.slope;
+  }
 }
 
 std::optional<GroundLevel> GroundSurface::At(const Eigen::Vector2d& place) const {

@@ -161,6 +161,7 @@ MapFiles TreeMappingStage::Files(const std::map<std::string, std::string>& confi
   files.snapshot = mapper_.Snapshot();
   files.next_landmark_id = files.snapshot.next_landmark_id;
   files.topology = topology_.state();
+  files.ground = ground_.Patches();
   files.config = config;
   files.georeference = georeferencer_.Solve(files.trajectory);
   const bool loaded_is_better =
@@ -179,7 +180,7 @@ void TreeMappingStage::Load(const MapFiles& files) {
   georeferencer_.Clear();
   loaded_georeference_ = files.georeference;
   cloud_.Restore(files.points);
-  ground_.Clear();
+  ground_.Restore(files.ground);
   model_ = BuildModel(files.model.stamp_ns);
 }
 

@@ -97,6 +97,7 @@ MapFiles SomeMap() {
     pose.T_map_lidar.translation() = Vector3d(0.1 * i, 1.0 / 3.0, -2.0);
     files.trajectory.push_back(pose);
   }
+  files.ground = {{12, {-0.25, 1.0 / 3.0}, -1.6, {0.01, -0.02}}, {3, {1.5, 0.5}, -1.5, {0.0, 0.1}}};
   files.config = {{"topology/join_gap_m", "1"}, {"seg/method", "network"}};
   return files;
 }
@@ -115,6 +116,13 @@ TEST_F(Directory, WhatIsSavedIsLoaded) {
                                    "tree_map.json",
                                    "trees.csv"));
   const MapFiles loaded = LoadMap(map_);
+  ASSERT_EQ(loaded.ground.size(), 2u);
+  for (std::size_t i = 0; i < 2; ++i) {
+    EXPECT_EQ(loaded.ground[i].count, saved.ground[i].count);
+    EXPECT_EQ(loaded.ground[i].foot, saved.ground[i].foot);
+    EXPECT_EQ(loaded.ground[i].z_m, saved.ground[i].z_m);
+    EXPECT_EQ(loaded.ground[i].slope, saved.ground[i].slope);
+  }
   ASSERT_EQ(loaded.landmarks.size(), saved.landmarks.size());
   for (std::size_t i = 0; i < saved.landmarks.size(); ++i) {
     const Landmark &a = saved.landmarks[i], &b = loaded.landmarks[i];

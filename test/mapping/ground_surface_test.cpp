@@ -57,6 +57,20 @@ TEST(GroundSurface, OnAHillTheNearPlanesDecideAndTheirDisagreementIsTheSigma) {
   }
 }
 
+TEST(GroundSurface, IsTheSameAfterAFile) {
+  const auto hill = [](double x, double y) { return 1.2 * std::sin(x / 8.0) + 0.05 * y; };
+  GroundSurface surface, restored;
+  for (int i = 0; i < 200; ++i) See(hill, 0.12 * i - 7.0, 3.0, 0.0, 0.0, &surface);
+  restored.Restore(surface.Patches());
+  for (const double x : {-5.0, 4.0, 10.0}) {
+    EXPECT_NEAR(restored.At({x, 0.0})->z_m, surface.At({x, 0.0})->z_m, 1e-12);
+    EXPECT_NEAR(restored.At({x, 0.0})->sigma_m, surface.At({x, 0.0})->sigma_m, 1e-12);
+  }
+  // And goes on.
+  for (GroundSurface* s : {&surface, &restored}) See(hill, 2.0, 4.0, 0.0, 0.0, s);
+  EXPECT_NEAR(restored.At({2.0, 5.0})->z_m, surface.At({2.0, 5.0})->z_m, 1e-12);
+}
+
 TEST(GroundSurface, LeavesOutBanksFarGroundAndTooFewScans) {
   const auto flat = [](double, double) { return 0.0; };
   const auto bank = [](double x, double) { return 0.8 * x; };

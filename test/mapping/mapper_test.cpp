@@ -5,6 +5,7 @@
 
 #include <gtest/gtest.h>
 
+#include "dendro_slam/mapping/pipeline.h"
 #include "synthetic_tree.h"
 
 namespace dendro {
@@ -286,6 +287,37 @@ TEST(Mapper, ASecondSessionFindsItselfAndKeepsTheIds) {
              flight2.truth.back().translation())
                 .norm(),
             0.1);
+}
+
+// Breast height counts from the ground, which a level path from 0.8 m up sees, but not the foot of the trunk.
+TEST(TreeMappingStage, ALoadedMapStandsOnItsGround) {
+  World world(ThesisLikeTree(), 18);
+  TreeMappingStage stage{TreeMappingConfig{}};
+  DriftingOdometry odometry(&world);
+  for (int i = 0; i < 120; ++i) {
+    const Eigen::Isometry3d T = CirclePose(0.1 * i, 4.0, 1.0, 1.8, 0.0);
+    MapperInput input;
+    input.stamp_ns = 100000000LL * (i + 1);
+    input.cylinders = world.Scan(T);
+    input.T_odom_lidar = odometry.Next(T);
+    GroundPlane ground;
+    ground.normal = (T.linear().transpose() * Eigen::Vector3d::UnitZ()).cast<float>();
+    ground.offset = static_cast<float>(T.translation().z());
+    stage.Process(input, ground);
+  }
+  const MapFiles saved = stage.Files({});
+  ASSERT_EQ(saved.model.trees.size(), 1u);
+  ASSERT_TRUE(saved.model.trees[0].dbh_m);
+  TreeMappingStage later{TreeMappingConfig{}};
+  later.Load(saved);
+  const MapFiles again = later.Files({});
+  ASSERT_EQ(again.model.trees.size(), 1u);
+  EXPECT_NEAR(*again.model.trees[0].dbh_m, *saved.model.trees[0].dbh_m, 1e-9);
+  EXPECT_NEAR(again.model.trees[0].height_m, saved.model.trees[0].height_m, 1e-9);
+  ASSERT_EQ(again.model.cylinders.size(), saved.model.cylinders.size());
+  for (std::size_t i = 0; i < saved.model.cylinders.size(); ++i) {
+    EXPECT_EQ(again.model.cylinders[i].id, saved.model.cylinders[i].id);
+  }
 }
 
 TEST(Mapper, ManyLapsLeaveAGraphOfOne) {

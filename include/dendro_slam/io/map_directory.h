@@ -14,6 +14,7 @@
 #include "dendro_slam/cylinder_fitting/fitted_cylinder.h"
 #include "dendro_slam/io/stage_timer.h"
 #include "dendro_slam/mapping/georeference.h"
+#include "dendro_slam/mapping/ground_surface.h"
 #include "dendro_slam/mapping/landmark.h"
 #include "dendro_slam/mapping/mapper.h"
 #include "dendro_slam/mapping/tree_model.h"
@@ -38,6 +39,7 @@ struct MapFiles {
                                     ///< tree_map.json holds it complete (every LandmarkState).
   int next_landmark_id = 0;
   TopologyState topology;
+  std::vector<GroundPatch> ground;      ///< Below the trees; without it breast height is not known again.
   std::vector<StampedPose> trajectory;  ///< Ascending stamps.
   std::vector<CloudPoint> points;       ///< Empty unless they were gathered (MapCloud).
   std::string frame = "map";

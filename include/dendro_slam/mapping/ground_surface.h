@@ -3,6 +3,7 @@
 #include <map>
 #include <optional>
 #include <utility>
+#include <vector>
 
 #include <Eigen/Core>
 #include <Eigen/Geometry>
@@ -15,6 +16,14 @@ namespace dendro {
 struct GroundLevel {
   double z_m = 0.0;      ///< Map frame.
   double sigma_m = 0.0;  ///< Standard deviation: how much the walk's planes disagree there.
+};
+
+/// What the scans taken in one cell of the walk say of the ground, for files.
+struct GroundPatch {
+  int count = 0;                                    ///< Scans. >= 1.
+  Eigen::Vector2d foot = Eigen::Vector2d::Zero();   ///< Mean place of the lidar, x, y in the map frame [m].
+  double z_m = 0.0;                                 ///< Mean height of their planes below them.
+  Eigen::Vector2d slope = Eigen::Vector2d::Zero();  ///< Mean of dz/dx, dz/dy.
 };
 
 /// The ground below the trees as the scans of a walk showed it, so that every tree of a map stands on
@@ -35,6 +44,10 @@ class GroundSurface {
   std::optional<GroundLevel> At(const Eigen::Vector2d& place) const;
 
   void Clear() { patches_.clear(); }
+
+  /// Everything, to go on in a later session.
+  std::vector<GroundPatch> Patches() const;
+  void Restore(const std::vector<GroundPatch>& patches);
 
  private:
   /// Sums over the scans taken in one cell.
