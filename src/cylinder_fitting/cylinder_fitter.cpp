@@ -801,8 +801,16 @@ FittedCylinder SegmentFit::Fit() {
     return unresolved(non_finite_ > 0 ? UnresolvedReason::kNonFinite
                                       : UnresolvedReason::kTooFewPoints);
   }
-  if (num_rings_ < config_.min_rings) return unresolved(UnresolvedReason::kTooFewRings);
+  const auto too_few_rings = [&](int rings, double radius) {
+    return rings < (radius <= config_.twig_radius_m ? 2 : config_.min_rings);
+  };
+  if (too_few_rings(num_rings_, 0.0)) return unresolved(UnresolvedReason::kTooFewRings);
   const std::optional<Cone> start = Start();
+  // Far from a twig: no need to finish it.
+  constexpr double kStartFactor = 2.0;
+  if (start && too_few_rings(num_rings_, start->radius / kStartFactor)) {
+    return unresolved(UnresolvedReason::kTooFewRings);
+  }
   if (!start) return unresolved(UnresolvedReason::kNotConverged);
 
   Estimate estimate;
@@ -832,7 +840,7 @@ FittedCylinder SegmentFit::Fit() {
   Report(estimate, &out);
   if (!estimate.converged) return unresolved(UnresolvedReason::kNotConverged);
   if (out.num_points < config_.min_points) return unresolved(UnresolvedReason::kNotACylinder);
-  if (out.num_rings < config_.min_rings) return unresolved(UnresolvedReason::kTooFewRings);
+  if (too_few_rings(out.num_rings, r)) return unresolved(UnresolvedReason::kTooFewRings);
   if (estimate.sigma > config_.max_residual_sigma_m ||
       3 * out.num_points < 2 * static_cast<int>(beams_.size()) ||
       (estimate.edges >= 4 && 3 * estimate.edges_violated > estimate.edges)) {
@@ -863,6 +871,7 @@ void CylinderFitterConfig::Validate() const {
   const auto not_negative = [](double v) { return std::isfinite(v) && v >= 0.0; };
   Require(min_points >= 6, "min_points", ">= 6");
   Require(min_rings >= 2, "min_rings", ">= 2");
+  Require(std::isfinite(twig_radius_m) && twig_radius_m >= 0.0, "twig_radius_m", ">= 0");
   Require(positive(min_radius_m), "min_radius_m", "> 0");
   Require(std::isfinite(max_radius_m) && max_radius_m > min_radius_m, "max_radius_m",
           "> min_radius_m");

@@ -169,6 +169,24 @@ bool IsPhantomBeside(const Landmark& piece, const Landmark& other) {
   return true;
 }
 
+// True when a place lies in the wood of a landmark.
+bool IsInside(const Eigen::Vector3d& place, const Landmark& landmark) {
+  const double s = (place - landmark.cylinder.point).dot(landmark.cylinder.axis);
+  const double radius = landmark.RadiusAt(s);
+  if (s < landmark.s_min_m - radius || s > landmark.s_max_m + radius) return false;
+  return (place - landmark.PointAt(std::clamp(s, landmark.s_min_m, landmark.s_max_m))).norm() < radius;
+}
+
+// True when `piece` cuts the corner of an elbow: it begins in one of two pieces that meet and ends in the
+// other, and fewer scans saw it than either.
+bool CutsCorner(const Landmark& piece, const Landmark& a, const Landmark& b) {
+  if (piece.num_scans >= std::min(a.num_scans, b.num_scans)) return false;
+  const Eigen::Vector3d begin = piece.PointAt(piece.s_min_m), end = piece.PointAt(piece.s_max_m);
+  if (!(IsInside(begin, a) && IsInside(end, b)) && !(IsInside(begin, b) && IsInside(end, a))) return false;
+  return IsInside(a.PointAt(a.s_min_m), b) || IsInside(a.PointAt(a.s_max_m), b) ||
+         IsInside(b.PointAt(b.s_min_m), a) || IsInside(b.PointAt(b.s_max_m), a);
+}
+
 }  // namespace
 
 std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
@@ -200,6 +218,21 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
     }
     return true;
   };
+  for (std::size_t k = 0; k < landmarks.size(); ++k) {
+    std::vector<std::size_t> around;  // that an end of this one lies in
+    for (std::size_t i = 0; i < landmarks.size(); ++i) {
+      if (i != k && !dropped[i] &&
+          (IsInside(landmarks[k].PointAt(landmarks[k].s_min_m), landmarks[i]) ||
+           IsInside(landmarks[k].PointAt(landmarks[k].s_max_m), landmarks[i]))) {
+        around.push_back(i);
+      }
+    }
+    for (const std::size_t i : around) {
+      for (const std::size_t j : around) {
+        if (i < j && CutsCorner(landmarks[k], landmarks[i], landmarks[j])) dropped[k] = true;
+      }
+    }
+  }
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
     for (std::size_t j = i + 1; j < landmarks.size() && !dropped[i]; ++j) {
       if (dropped[j]) continue;

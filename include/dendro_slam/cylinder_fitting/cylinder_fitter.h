@@ -15,6 +15,7 @@ struct CylinderFitterConfig {
 
   int min_points = 8;          ///< Fewer returns: UNRESOLVED. >= 6.
   int min_rings = 3;           ///< Fewer rings: UNRESOLVED. >= 2.
+  double twig_radius_m = 0.03; ///< Wood up to this radius needs two rings only: its silhouettes tell it [m]. >= 0.
   double min_radius_m = 0.003; ///< Thinner: UNRESOLVED [m]. > 0.
   double max_radius_m = 0.8;   ///< Thicker: UNRESOLVED [m]. > min_radius_m.
   double min_visible_arc_deg = 60.0;       ///< Less surface seen: UNRESOLVED [deg]. > 0.
@@ -46,6 +47,7 @@ struct CylinderFitterConfig {
     v("marshall_only", marshall_only);
     v("min_points", min_points);
     v("min_rings", min_rings);
+    v("twig_radius_m", twig_radius_m);
     v("min_radius_m", min_radius_m);
     v("max_radius_m", max_radius_m);
     v("min_visible_arc_deg", min_visible_arc_deg);

@@ -10,11 +10,11 @@ namespace dendro {
 struct RadiusProfileConfig {
   double knot_spacing_m = 0.25;     ///< Distance of the knots along the axis [m]. > 0.
   int direction_bins = 18;          ///< Viewing directions around the axis told apart. 1 to 36.
-  double bin_sigma_rel = 0.02;      ///< Error that scans from one direction and distance share, as a
+  double bin_sigma_rel = 0.009;     ///< Error that scans from one direction and distance share, as a
                                     ///< part of the radius. >= 0.
-  double bin_sigma_m = 0.0007;      ///< The same, absolute [m]. >= 0.
-  double common_sigma_rel = 0.003;  ///< Error that all scans share, as a part of the radius. >= 0.
-  double common_sigma_m = 0.0008;      ///< The same, absolute [m]. >= 0.
+  double bin_sigma_m = 0.0004;      ///< The same, absolute [m]. >= 0.
+  double common_sigma_rel = 0.001;  ///< Error that all scans share, as a part of the radius. >= 0.
+  double common_sigma_m = 0.0002;      ///< The same, absolute [m]. >= 0.
   double outlier_sigma = 3.0;       ///< Observations farther from the profile lose weight. > 0.
 
   /// @throws std::invalid_argument naming the field.

@@ -112,7 +112,7 @@ struct LandmarkMerge {
 
 /// Cuts landmarks that run inside each other (the pieces of one bent trunk or branch) in the middle of
 /// their common stretch, and leaves out those that lie within another one, or close beside one that a
-/// multitude of scans saw while hardly any saw them.
+/// multitude of scans saw while hardly any saw them, or that cut the corner of an elbow.
 /// @param landmarks  Ascending in id.
 std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks);
 
