@@ -12,8 +12,9 @@ constexpr double kMaxReachM = 10.0;
 constexpr int kMinScans = 10;
 // A plane counts half at this distance, and a sixteenth less with every doubling.
 constexpr double kHalfWeightM = 3.0;
-// What all planes may be wrong by together: pose and mounting height, grass.
-constexpr double kFloorM = 0.02;
+// What all planes may be wrong by together: pose and mounting height, grass, bumps (six generated trees on
+// rough ground, used in tuning, had their DBH 0.19 cm off, RMS, where 2 cm allowed for 0.16).
+constexpr double kFloorM = 0.03;
 
 std::pair<int, int> CellOf(const Eigen::Vector2d& foot) {
   return {static_cast<int>(std::floor(foot.x() / kCellM)), static_cast<int>(std::floor(foot.y() / kCellM))};
