@@ -75,6 +75,7 @@ class MapVisualization : public nodelet::Nodelet {
     nh.getParamCached("updates", config.updates);
     nh.getParamCached("alpha", config.alpha);
     nh.getParamCached("label_height_m", config.label_height_m);
+    nh.getParamCached("label_min_radius_m", config.label_min_radius_m);
     if (config == config_) return;
     try {
       config.Validate();
@@ -117,6 +118,7 @@ class MapVisualization : public nodelet::Nodelet {
     style.skeleton = config_.skeleton;
     style.alpha = config_.alpha;
     style.label_height_m = config_.label_height_m;
+    style.label_min_radius_m = config_.label_min_radius_m;
     style.max_triangles = config_.max_triangles;
     return style;
   }

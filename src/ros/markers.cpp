@@ -264,7 +264,7 @@ class LabelHeights {
 };
 
 /// The labels of a tree (-1: of what is attached to none), the most important first.
-std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id) {
+std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id, double min_radius_m) {
   Eigen::Vector2d axis = Eigen::Vector2d::Zero();
   for (const dendro::MapTree& tree : model.trees) {
     if (tree.id == tree_id) axis = tree.base.head<2>();
@@ -292,6 +292,7 @@ std::vector<Label> LabelsOf(const dendro::TreeModel& model, int tree_id) {
                                100.0 * *tree->dbh_m,
                                100.0 * tree->dbh_sigma_m);
     } else {
+      if (branch->order > 0 && branch->base_radius_m < min_radius_m) continue;
       // At its free end, where a line to the label crosses no other wood.
       label.anchor = branch->order == 0 ? 0.5 * (branch->base + branch->tip) : branch->tip;
       const Eigen::Vector2d run = label.anchor.head<2>() - axis;
@@ -324,7 +325,7 @@ void AppendLabels(const dendro::TreeModel& model,
   leaders.scale.x = kLeaderWidthM;
   leaders.color = soft;
   LabelHeights heights(kStep * style.label_height_m);
-  for (const Label& label : LabelsOf(model, tree_id)) {
+  for (const Label& label : LabelsOf(model, tree_id, style.label_min_radius_m)) {
     const std::optional<double> height = heights.Take(label.anchor.z() + style.label_height_m);
     if (!height) continue;
     // Beyond the wood by half its own width: its letters stand before the background, not on wood.

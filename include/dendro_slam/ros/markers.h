@@ -46,6 +46,8 @@ struct MapMarkerStyle {
   bool skeleton = true;          ///< Centre lines of the branches and where they leave their parents.
   double alpha = 0.9;            ///< Opacity of the cylinders, 0 (not drawn) to 1.
   double label_height_m = 0.15;  ///< Height of the letters [m]. > 0.
+  double label_min_radius_m = 0.02;  ///< Thinner branches go without a label: a crown of twigs would be
+                                     ///< covered by them [m]. >= 0.
   int max_triangles = 400000;    ///< Big maps get fewer sides per cylinder to stay below this.
 };
 

@@ -137,6 +137,7 @@ struct MapVisualizationNodeConfig {
   bool updates = true;           ///< Flash the cylinders that the last scan observed.
   double alpha = 0.9;            ///< Opacity of the cylinders; 0: not drawn. 0 to 1.
   double label_height_m = 0.15;  ///< Height of the letters [m]. > 0.
+  double label_min_radius_m = 0.02;  ///< Branches thinner at their base go without a label [m]. >= 0.
   int max_triangles = 400000;    ///< Big maps get cylinders with fewer sides. >= 1000.
   std::string tree_frame = "tree";     ///< Frame in the middle of the first tree, for a view's camera.
   std::string icp_frame = "icp_odom";  ///< Frame of the ICP odometry, shown from where the map begins.
@@ -147,6 +148,7 @@ struct MapVisualizationNodeConfig {
     }
     if (!(alpha >= 0.0 && alpha <= 1.0)) throw std::invalid_argument("alpha must be from 0 to 1");
     if (!(label_height_m > 0.0)) throw std::invalid_argument("label_height_m must be positive");
+    if (!(label_min_radius_m >= 0.0)) throw std::invalid_argument("label_min_radius_m must be >= 0");
     if (max_triangles < 1000) throw std::invalid_argument("max_triangles must be at least 1000");
   }
   template <class Visitor>
@@ -157,6 +159,7 @@ struct MapVisualizationNodeConfig {
     v("updates", updates);
     v("alpha", alpha);
     v("label_height_m", label_height_m);
+    v("label_min_radius_m", label_min_radius_m);
     v("max_triangles", max_triangles);
     v("tree_frame", tree_frame);
     v("icp_frame", icp_frame);
@@ -164,6 +167,7 @@ struct MapVisualizationNodeConfig {
   bool operator==(const MapVisualizationNodeConfig& o) const {
     return color == o.color && labels == o.labels && skeleton == o.skeleton &&
            updates == o.updates && alpha == o.alpha && label_height_m == o.label_height_m &&
+           label_min_radius_m == o.label_min_radius_m &&
            max_triangles == o.max_triangles;
   }
 };
