@@ -171,7 +171,11 @@ bool IsPhantomBeside(const Landmark& piece, const Landmark& other) {
 
 // True when a place lies in the wood of a landmark.
 bool IsInside(const Eigen::Vector3d& place, const Landmark& landmark) {
-  const double s = (place - landmark.cylinder.point).dot(landmark.cylinder.axis);
+  constexpr double kThickestM = 1.0;  // Radius and bend together.
+  const Eigen::Vector3d d = place - landmark.cylinder.point;
+  const double reach = std::max(std::abs(landmark.s_min_m), std::abs(landmark.s_max_m)) + kThickestM;
+  if (d.squaredNorm() > reach * reach) return false;
+  const double s = d.dot(landmark.cylinder.axis);
   const double radius = landmark.RadiusAt(s);
   if (s < landmark.s_min_m - radius || s > landmark.s_max_m + radius) return false;
   return (place - landmark.PointAt(std::clamp(s, landmark.s_min_m, landmark.s_max_m))).norm() < radius;
@@ -219,11 +223,11 @@ std::vector<Landmark> SeparatePieces(std::vector<Landmark> landmarks) {
     return true;
   };
   for (std::size_t k = 0; k < landmarks.size(); ++k) {
+    const Eigen::Vector3d begin = landmarks[k].PointAt(landmarks[k].s_min_m);
+    const Eigen::Vector3d end = landmarks[k].PointAt(landmarks[k].s_max_m);
     std::vector<std::size_t> around;  // that an end of this one lies in
     for (std::size_t i = 0; i < landmarks.size(); ++i) {
-      if (i != k && !dropped[i] &&
-          (IsInside(landmarks[k].PointAt(landmarks[k].s_min_m), landmarks[i]) ||
-           IsInside(landmarks[k].PointAt(landmarks[k].s_max_m), landmarks[i]))) {
+      if (i != k && !dropped[i] && (IsInside(begin, landmarks[i]) || IsInside(end, landmarks[i]))) {
         around.push_back(i);
       }
     }

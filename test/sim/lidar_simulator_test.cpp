@@ -10,6 +10,8 @@
 
 #include <gtest/gtest.h>
 
+#include "cylinder_information.h"
+
 #include "dendro_slam/sim/flight_path.h"
 #include "dendro_slam/sim/scene_generator.h"
 
@@ -156,6 +158,38 @@ TEST(LidarSimulator, EvenNoiseIsEvenAndBounded) {
   EXPECT_NEAR(std::sqrt(square / n), std::hypot(0.01, 0.03 / std::sqrt(3.0)), 4e-4);
   config.range_uniform_m = -0.01;
   EXPECT_THROW(config.Validate(), std::invalid_argument);
+}
+
+// What the Cramer-Rao bound of fit_benchmark expects of a beam on a leaning cylinder.
+TEST(LidarSimulator, TheBoundOfTheFitExpectsWhatIsSimulated) {
+  const double radius = 0.08;
+  const Eigen::Vector3d axis = Eigen::Vector3d(0.2, 0.3, 1.0).normalized(), centre(4.0, 0.0, 0.0);
+  Scene scene = EmptyScene();
+  SceneTree tree;
+  tree.branches.push_back({0, -1, {{centre - 10.0 * axis, radius}, {centre + 10.0 * axis, radius}}, false});
+  scene.trees.push_back(tree);
+  const Raycaster raycaster(scene);
+  LidarSimulatorConfig config = Ideal();
+  config.enable_footprint = true;
+  config.sub_rays_width = 24;
+  config.sub_rays_height = 9;
+  const SimulatedScan out = LidarSimulator(raycaster, config).SimulateScan(0, Eigen::Isometry3d::Identity());
+  const Cylinder cylinder{axis, centre, 1.0 / radius};
+  double square = 0.0;
+  int whole = 0, cut = 0;
+  for (const LidarPoint& p : out.scan.points) {
+    const Eigen::Vector3d origin(0, 0, vlp16::RingVerticalOffsetM(p.ring));
+    const Eigen::Vector3d ray = p.position.cast<double>() - origin;
+    const BeamExpectation expected = ExpectBeam(cylinder, origin, ray.normalized(), config);
+    EXPECT_GT(expected.part, 0.0);
+    ++(expected.part > 0.999 ? whole : cut);
+    const double error = ray.norm() - expected.range_m;
+    EXPECT_LT(std::abs(error), 0.006) << expected.part;
+    square += error * error;
+  }
+  EXPECT_GT(whole, 50);
+  EXPECT_GT(cut, 10);
+  EXPECT_LT(std::sqrt(square / (whole + cut)), 0.0015);
 }
 
 TEST(LidarSimulator, EdgeOfAPlateBlursOverTheFootprint) {

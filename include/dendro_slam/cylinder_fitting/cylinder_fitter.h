@@ -14,8 +14,8 @@ struct CylinderFitterConfig {
   bool marshall_only = false;  ///< Stop after the thesis' fit (eq. 4.2, corrected); for comparison.
 
   int min_points = 8;          ///< Fewer returns: UNRESOLVED. >= 6.
-  int min_rings = 3;           ///< Fewer rings: UNRESOLVED. >= 2.
-  double twig_radius_m = 0.03; ///< Wood up to this radius needs two rings only: its silhouettes tell it [m]. >= 0.
+  int min_rings = 3;           ///< Fewer rings on wood thicker than a twig: UNRESOLVED. >= 2.
+  double twig_radius_m = 0.03; ///< Wood up to this radius needs two rings: its silhouettes tell it [m]. >= 0.
   double min_radius_m = 0.003; ///< Thinner: UNRESOLVED [m]. > 0.
   double max_radius_m = 0.8;   ///< Thicker: UNRESOLVED [m]. > min_radius_m.
   double min_visible_arc_deg = 60.0;       ///< Less surface seen: UNRESOLVED [deg]. > 0.

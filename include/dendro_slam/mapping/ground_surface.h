@@ -45,8 +45,9 @@ class GroundSurface {
 
   void Clear() { patches_.clear(); }
 
-  /// Everything, to go on in a later session.
+  /// Everything, to go on in a later session; by cell, ascending.
   std::vector<GroundPatch> Patches() const;
+  /// Takes up what Patches() gave in place of what is here.
   void Restore(const std::vector<GroundPatch>& patches);
 
  private:

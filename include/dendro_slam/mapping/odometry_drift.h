@@ -16,7 +16,9 @@ inline constexpr int kDriftDimension = 4;
 
 /// What a motion's translation [m] has too much per unit of the drift: for a measured motion m of the
 /// odometry, `m.translation() - DriftJacobian(...) * drift` is the one without it.
-/// @param R_odom_from  Attitude of the odometry where the motion begins.
+/// @param T_from_to_measured  Motion of the lidar as the odometry has it, in the frame where it begins [m].
+/// @param R_odom_from         Attitude there in the odometry's own frame.
+/// @return  Shape (3, 4): scale [m], then sliding along x, y, z, each per kDriftWayM of way.
 Eigen::Matrix<double, 3, kDriftDimension> DriftJacobian(const Eigen::Isometry3d& T_from_to_measured,
                                                         const Eigen::Matrix3d& R_odom_from);
 
