@@ -92,7 +92,10 @@ class Separation {
   Run Shifted(const Run& run, double reference) const;
   Run Part(const Run& run, int first, int last) const;
   std::vector<Run> CutAtForks(std::vector<Run> runs, int row) const;
-  bool BoundedByCloser(const Run& run) const;
+  bool CloserBeside(const Run& run, int side) const;
+  bool BoundedByCloser(const Run& run) const { return CloserBeside(run, -1) || CloserBeside(run, 1); }
+  bool WasHidden(const Track& track, int side) const;
+  bool WasHidden(const Track& track) const { return WasHidden(track, -1) || WasHidden(track, 1); }
   bool HiddenBetween(const Run& a, const Run& b) const;
   void Assign(std::vector<Run> runs, int row);
   void ReleaseExcess();
@@ -256,6 +259,7 @@ std::vector<Run> Separation::CutAtForks(std::vector<Run> runs, int row) const {
   for (Run& run : runs) {
     struct Inside {
       Expectation e;
+      const Track* track;
     };
     std::vector<Inside> inside;
     for (const Track& track : tracks_) {
@@ -271,7 +275,7 @@ std::vector<Run> Separation::CutAtForks(std::vector<Run> runs, int row) const {
                         spacing * max_row_tan_ + 4.0 * config_.range_sigma_m + e.width * 0.5 *
                         run.range * column_angle_;
       if (overlap < 0.5 * e.width || deep) continue;
-      inside.push_back({e});
+      inside.push_back({e, &track});
     }
     if (inside.empty()) {
       out.push_back(std::move(run));
@@ -285,15 +289,21 @@ std::vector<Run> Separation::CutAtForks(std::vector<Run> runs, int row) const {
     const bool wide = run.width() > config_.fork_width_ratio * expected_width;
     const int excess_left = static_cast<int>(std::floor(inside.front().e.left() - 1.0)) - run.first;
     const int excess_right = run.last - static_cast<int>(std::ceil(inside.back().e.right() + 1.0));
-    if (wide && excess_left >= config_.fork_min_excess_pixels) cuts.push_back(run.first + excess_left);
+    // What a nearer branch uncovers row by row is no fork: neither the ends of the rows before were the
+    // track's own nor was its course.
+    if (wide && excess_left >= config_.fork_min_excess_pixels && !WasHidden(*inside.front().track)) {
+      cuts.push_back(run.first + excess_left);
+    }
     for (std::size_t i = 1; i < inside.size(); ++i) {
+      // Two sides of one trunk that come together where a nearer branch ends.
+      if (WasHidden(*inside[i - 1].track, 1) && WasHidden(*inside[i].track, -1)) continue;
       const int cut =
           static_cast<int>(std::lround(0.5 * (inside[i - 1].e.right() + inside[i].e.left()) + 0.5));
       if (cut > run.first && cut <= run.last && (cuts.empty() || cut > cuts.back())) {
         cuts.push_back(cut);
       }
     }
-    if (wide && excess_right >= config_.fork_min_excess_pixels) {
+    if (wide && excess_right >= config_.fork_min_excess_pixels && !WasHidden(*inside.back().track)) {
       const int cut = run.last - excess_right + 1;
       if (cuts.empty() || cut > cuts.back()) cuts.push_back(cut);
     }
@@ -313,14 +323,23 @@ std::vector<Run> Separation::CutAtForks(std::vector<Run> runs, int row) const {
   return out;
 }
 
-// True when a nearer surface may hide the rest of the run on either side.
-bool Separation::BoundedByCloser(const Run& run) const {
-  for (const int col : {run.first - 1, run.last + 1}) {
-    const auto pixel = static_cast<std::size_t>(Pixel(run.row, col));
-    if (image_.HasReturn(pixel) && image_.point[pixel].allFinite() &&
-        Range(static_cast<std::int32_t>(pixel)) < run.range - 4.0 * config_.range_sigma_m) {
-      return true;
-    }
+// True when a nearer surface may hide the rest of the run on a side: -1 before its first column, 1
+// behind its last.
+bool Separation::CloserBeside(const Run& run, int side) const {
+  const std::int32_t beside = Pixel(run.row, side < 0 ? run.first - 1 : run.last + 1);
+  const auto pixel = static_cast<std::size_t>(beside);
+  return image_.HasReturn(pixel) && image_.point[pixel].allFinite() &&
+         Range(beside) < run.range - 4.0 * config_.range_sigma_m;
+}
+
+// True when one of the rows that Expect() reads from was hidden on a side: its end there is not the
+// track's.
+bool Separation::WasHidden(const Track& track, int side) const {
+  std::size_t rows = 0;
+  for (auto it = track.runs.rbegin(); it != track.runs.rend(); ++it) {
+    rows += it == track.runs.rbegin() || std::prev(it)->row != it->row;
+    if (rows > kHistoryRows) break;
+    if (CloserBeside(*it, side)) return true;
   }
   return false;
 }
@@ -432,6 +451,7 @@ void Separation::ReleaseExcess() {
         if (k == i) continue;
         const Run& other = runs[static_cast<std::size_t>(k)];
         if (other.row == run.row) alone = false;
+        if (BoundedByCloser(other)) continue;  // It does not show how wide it is.
         width[n] = other.width() * other.range / run.range;
         centre[n] = 0.5 * (other.first + other.last);
         row[n] = other.row;

@@ -195,6 +195,13 @@ struct Estimate {
   bool converged = false;
 };
 
+// Only neighbours across the axis see the silhouette; one along it sees an end.
+bool IsAcross(const Edge& edge, const BeamOnCone& hit, const BeamOnCone& miss) {
+  const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
+  const double least = edge.across_rings ? kLeastCrossingOfRings : kLeastCrossing;
+  return std::abs(miss.offset - hit.offset) >= least * apart;
+}
+
 double Median(std::vector<double> values) {
   if (values.empty()) return 0.0;
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
@@ -248,6 +255,7 @@ class SegmentFit {
                  StateVector* vector,
                  std::vector<Interval>* intervals) const;
   Estimate Refine(const Cone& start) const;
+  bool SeesASide(const BentCone& cone) const;
   void Report(const Estimate& estimate, FittedCylinder* out) const;
 
   const RangeImage& image_;
@@ -255,6 +263,7 @@ class SegmentFit {
   const CylinderFitterConfig& config_;
   std::vector<Beam> beams_;
   std::vector<Edge> edges_;
+  std::vector<Edge> hidden_edges_;  // Where the segment ends and another surface goes on.
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();  // Mean optical centre.
   Eigen::Vector3d centroid_ = Eigen::Vector3d::Zero();
   double bright_ = 0.0;  // Intensity of a full hit.
@@ -348,7 +357,10 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
     const double behind =
         static_cast<double>((image_.point[next] - image_.beam_origin[next]).norm());
     // A nearer surface hides the silhouette; one close behind mixes with it.
-    if (!(behind > range + std::max(config_.echo_separation_m, 6.0 * config_.range_sigma_m))) return;
+    if (!(behind > range + std::max(config_.echo_separation_m, 6.0 * config_.range_sigma_m))) {
+      hidden_edges_.push_back(edge);
+      return;
+    }
     const double brightness = image_.intensity.size() == image_.size()
                                   ? static_cast<double>(image_.intensity[next])
                                   : 0.0;
@@ -603,11 +615,7 @@ void SegmentFit::Linearise(Estimate* estimate,
     const BeamOnCone miss = LocateBeam(cone, edge.miss.origin, edge.miss.direction);
     if (!hit.valid || !miss.valid) continue;
     const double side = miss.offset > hit.offset ? 1.0 : -1.0;
-    const double width = side * (miss.offset - hit.offset);
-    // Only neighbours across the axis see the silhouette; one along it sees an end.
-    const double apart = edge.hit.range * (edge.miss.direction - edge.hit.direction).norm();
-    const double least = edge.across_rings ? kLeastCrossingOfRings : kLeastCrossing;
-    if (width < least * apart || side * miss.offset < 0.0) continue;
+    if (!IsAcross(edge, hit, miss) || side * miss.offset < 0.0) continue;
     // Beyond the stretch that is seen, a beam may miss because the branch ends there.
     const double spacing = edge.hit.range * 2.0 * M_PI / image_.cols;
     const double beyond = bent.StationOf(edge.miss.origin, edge.miss.direction);
@@ -693,6 +701,27 @@ Estimate SegmentFit::Refine(const Cone& start) const {
     }
   }
   return estimate;
+}
+
+// True when on one side at least most of the segment's ends look past it. With the same surface or a nearer
+// one beside it on both, what looks like a limb is where the segment was cut: a strip of a trunk passes for
+// a thin stem.
+bool SegmentFit::SeesASide(const BentCone& bent) const {
+  int seen[2] = {}, ends[2] = {};
+  const auto count = [&](const std::vector<Edge>& edges, int one) {
+    for (const Edge& edge : edges) {
+      const Cone cone = bent.Touching(bent.StationOf(edge.hit.origin, edge.hit.direction));
+      const BeamOnCone hit = LocateBeam(cone, edge.hit.origin, edge.hit.direction);
+      const BeamOnCone miss = LocateBeam(cone, edge.miss.origin, edge.miss.direction);
+      if (!hit.valid || !miss.valid || !IsAcross(edge, hit, miss)) continue;
+      const std::size_t side = miss.offset > hit.offset ? 1 : 0;
+      seen[side] += one;
+      ++ends[side];
+    }
+  };
+  count(edges_, 1);
+  count(hidden_edges_, 0);
+  return 2 * seen[0] > ends[0] || 2 * seen[1] > ends[1];
 }
 
 void SegmentFit::Report(const Estimate& estimate, FittedCylinder* out) const {
@@ -846,7 +875,8 @@ FittedCylinder SegmentFit::Fit() {
       (estimate.edges >= 4 && 3 * estimate.edges_violated > estimate.edges)) {
     return unresolved(UnresolvedReason::kNotACylinder);
   }
-  if (out.visible_arc_rad < config_.min_visible_arc_deg * kDegree) {
+  if (out.visible_arc_rad < config_.min_visible_arc_deg * kDegree ||
+      (!config_.marshall_only && !SeesASide(estimate.cone))) {
     return unresolved(UnresolvedReason::kArcTooSmall);
   }
   // A few rings on something thin and hardly longer than wide: a joint of twigs or a leaf. A short stem

@@ -160,6 +160,23 @@ TEST(BranchSeparator, BranchPassingInFrontIsNotMerged) {
   EXPECT_GT(static_cast<double>(pure) / static_cast<double>(points), 0.98);
 }
 
+// What a nearer branch uncovers row by row is the trunk's, not a row of branches leaving it.
+TEST(BranchSeparator, TrunkThatComesOutBehindABranchIsNotCutIntoStrips) {
+  const TestCone trunk = Upright(4.5, 0.0, 0.22, -1.5, 1.5);
+  for (const double side : {-1.0, 1.0}) {
+    const TestCone in_front{Vector3d(3.6, side * 0.15, -0.6), Vector3d(2.8, -side * 0.9, 1.1), 0.1, 0.1};
+    for (unsigned seed = 1; seed <= 4; ++seed) {
+      const TestScan test = SimulateCones({trunk, in_front}, TestSensor(), seed);
+      std::vector<std::size_t> of_trunk;
+      for (const Segment& s : BranchSeparator().Separate(test.scan)) {
+        if (Majority(test, s).first == 0) of_trunk.push_back(s.pixels.size());
+      }
+      // Below it, above it and both of its sides.
+      EXPECT_LE(of_trunk.size(), 4u) << seed;
+    }
+  }
+}
+
 TEST(BranchSeparator, CurvedBranchIsCutAndStraightTrunkIsNot) {
   std::vector<TestCone> arc;  // A quarter circle of radius 1.3 m in twelve short cones.
   for (int i = 0; i < 12; ++i) {

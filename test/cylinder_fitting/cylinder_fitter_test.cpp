@@ -395,6 +395,29 @@ TEST_F(Degenerate, Plane) {
   EXPECT_NE(fit.reason, UnresolvedReason::kNone);
 }
 
+// A few columns out of the middle of a trunk, or the strip that a nearer post leaves: where such a
+// segment ends is no silhouette, though a thin stem fits it.
+TEST_F(Degenerate, StripOfATrunk) {
+  for (const bool behind_posts : {false, true}) {
+    for (unsigned seed = 1; seed <= 30; ++seed) {
+      std::vector<TestCone> cones{Upright(4.3, 0.0, 0.22)};
+      if (behind_posts) {
+        cones.push_back(Upright(2.5, 0.12, 0.08));
+        cones.push_back(Upright(2.5, -0.12, 0.08));
+      }
+      TestScan test = SimulateCones(cones, TestSensor(), seed);
+      Segment strip;
+      for (const std::int32_t pixel : SegmentOf(test, 0).pixels) {
+        const int col = pixel % test.scan.image.cols;
+        if (std::min(col, test.scan.image.cols - col) <= 3) strip.pixels.push_back(pixel);
+      }
+      ASSERT_GT(strip.pixels.size(), 20u);
+      const FittedCylinder fit = CylinderFitter().FitSegment(test.scan, strip);
+      EXPECT_EQ(fit.status, FitStatus::kUnresolved) << fit.cylinder.radius() << " +- " << fit.radius_sigma_m();
+    }
+  }
+}
+
 TEST_F(Degenerate, Sphere) {
   std::mt19937 rng(3);
   std::normal_distribution<double> gauss(0.0, 0.01);

@@ -247,7 +247,7 @@ void CheckFit(const dendro::LabelledScan& scan,
   Require(fit.radius_sigma_m() > 0.0 &&
           fit.radius_sigma_m() <= config.max_radius_sigma_ratio * c.radius() + 0.5 * config.revolution_sigma_m);
   Require(Eigen::SelfAdjointEigenSolver<dendro::Matrix5d>(fit.covariance).eigenvalues().minCoeff() > -1e-9);
-  Require(fit.num_points >= config.min_points && fit.num_rings >= config.min_rings);
+  Require(fit.num_points >= config.min_points && fit.num_rings >= (c.radius() <= config.twig_radius_m ? 2 : config.min_rings));
   Require(fit.visible_arc_rad <= M_PI + 1e-9);
   // As many returns near the surface as it says; a bent axis leaves the straight one.
   const double length = fit.end_s_m - fit.start_s_m;

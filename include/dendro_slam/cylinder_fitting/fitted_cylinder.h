@@ -15,7 +15,7 @@ enum class UnresolvedReason : std::uint8_t {
   kTooFewPoints,
   kTooFewRings,
   kNonFinite,
-  kArcTooSmall,
+  kArcTooSmall,        ///< Too little of the surface is seen, or neither of its sides.
   kNotACylinder,       ///< Residuals too large: a plane, a sphere, a clump of leaves.
   kRadiusOutOfRange,
   kUncertain,          ///< The covariance is too large to call it a measurement.
