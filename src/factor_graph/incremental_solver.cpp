@@ -21,6 +21,7 @@ using internal::Clique;
 using internal::Damping;
 using internal::FactorRecord;
 using internal::GraphStore;
+using internal::PrefetchLines;
 using internal::VariableRecord;
 using internal::VariableState;
 
@@ -121,15 +122,19 @@ class IncrementalSolver::Impl {
   const SolverConfig& config() const { return config_; }
 
  private:
+  // A variable that a step moves, in tangent coordinates at its linearisation point.
+  struct Move {
+    int variable;
+    double before[kMaxTangentDimension];
+    double after[kMaxTangentDimension];            // Of the whole step.
+    double published_before[kMaxTangentDimension];
+  };
+
   // One step of back-substitution that can be undone.
   struct Step {
-    std::vector<int> variables;
-    std::vector<double> delta;      // Before, kMaxTangentDimension each.
-    std::vector<double> moved;      // After, of the whole step.
-    std::vector<double> published;  // Before.
-    std::vector<Value> estimate;    // Before.
-    std::vector<int> factors;
-    std::vector<double> errors;     // Before.
+    std::vector<Move> moves;
+    std::vector<int> factors;       // With a variable that moved.
+    std::vector<double> errors;     // Theirs, before.
     std::vector<int> cliques;       // Solved.
 
     void Clear();  // Keeps the memory.
@@ -160,6 +165,7 @@ class IncrementalSolver::Impl {
   void ComputeWeights();
   void Solve(double publish_threshold, double still_threshold, Step* step);
   void Undo(const Step& step);
+  void MoveEstimate(int slot);
   void Shorten(const Step& step, double fraction);
   void RebuildTree();
   void TakeBack(const std::vector<int>& factors, const std::vector<int>& variables);
@@ -390,50 +396,42 @@ double IncrementalSolver::Impl::EvaluateError(int slot) {
 // The factors lie scattered in memory, so the next ones are fetched while one is evaluated.
 void IncrementalSolver::Impl::EvaluateErrors(const std::vector<int>& slots) {
   constexpr std::size_t kAhead = 4;
-  constexpr int kLines = 11;  // Of 64 bytes: what a factor between two poses holds.
+  constexpr std::size_t kFactorBytes = 9 * 64;  // What a factor between two poses holds.
   for (std::size_t i = 0; i < slots.size(); ++i) {
-#ifdef __GNUC__
+    if (i + 3 * kAhead < slots.size()) {
+      PrefetchLines(&graph_.factors[slots[i + 3 * kAhead]], sizeof(FactorRecord));
+    }
     if (i + 2 * kAhead < slots.size()) {
-      __builtin_prefetch(graph_.factors[slots[i + 2 * kAhead]].variables.data());
+      PrefetchLines(graph_.factors[slots[i + 2 * kAhead]].variables.data(), 1);
     }
     if (i + kAhead < slots.size()) {
       const FactorRecord& next = graph_.factors[slots[i + kAhead]];
-      const char* object = reinterpret_cast<const char*>(next.factor.get());
-      for (int line = 0; line < kLines; ++line) __builtin_prefetch(object + 64 * line);
-      for (const int v : next.variables) {
-        const char* estimate = reinterpret_cast<const char*>(&graph_.variables[v].estimate);
-        for (int line = 0; line < 3; ++line) __builtin_prefetch(estimate + 64 * line);
-      }
+      PrefetchLines(next.factor.get(), kFactorBytes);
+      for (const int v : next.variables) PrefetchLines(&graph_.variables[v].estimate, sizeof(Value));
     }
-#endif
     SetError(slots[i], EvaluateError(slots[i]));
   }
 }
 
 // Fetches what back-substitution reads of the cliques after the one at `at`.
 void IncrementalSolver::Impl::Prefetch(const std::vector<int>& queue, std::size_t at) const {
-#ifdef __GNUC__
   constexpr std::size_t kAhead = 2;
-  constexpr std::size_t kDoublesPerLine = 8;
   constexpr std::size_t kMaxDoubles = 512;  // Beyond this the hardware has seen the stream.
   if (at + 3 * kAhead < queue.size()) {
-    __builtin_prefetch(&tree_.clique(queue[at + 3 * kAhead]));
+    PrefetchLines(&tree_.clique(queue[at + 3 * kAhead]), sizeof(Clique));
   }
   if (at + 2 * kAhead < queue.size()) {
-    __builtin_prefetch(tree_.clique(queue[at + 2 * kAhead]).variables.data());
+    const std::vector<int>& variables = tree_.clique(queue[at + 2 * kAhead]).variables;
+    PrefetchLines(variables.data(), variables.size() * sizeof(int));
   }
   if (at + kAhead < queue.size()) {
     const Clique& clique = tree_.clique(queue[at + kAhead]);
-    const std::size_t size = std::min(clique.conditional.size(), kMaxDoubles);
-    for (std::size_t i = 0; i < size; i += kDoublesPerLine) {
-      __builtin_prefetch(clique.conditional.data() + i);
-    }
+    PrefetchLines(clique.conditional.data(), std::min(clique.conditional.size(), kMaxDoubles) * sizeof(double));
     for (int i = 0; i < clique.num_frontal; ++i) {
-      const char* record = reinterpret_cast<const char*>(&graph_.variables[clique.variables[i]]);
-      for (std::size_t k = 0; k < sizeof(VariableRecord); k += 64) __builtin_prefetch(record + k);
+      PrefetchLines(&graph_.states[clique.variables[i]], sizeof(VariableState));
+      PrefetchLines(&graph_.variables[clique.variables[i]], sizeof(VariableRecord));
     }
   }
-#endif
 }
 
 void IncrementalSolver::Impl::SetError(int slot, double error) {
@@ -592,11 +590,7 @@ void IncrementalSolver::Impl::ComputeWeights() {
 // -------------------------------------------------------------------------------------------------
 
 void IncrementalSolver::Impl::Step::Clear() {
-  variables.clear();
-  delta.clear();
-  moved.clear();
-  published.clear();
-  estimate.clear();
+  moves.clear();
   factors.clear();
   errors.clear();
   cliques.clear();
@@ -613,13 +607,17 @@ void IncrementalSolver::Impl::Solve(double publish_threshold, double still_thres
   queue = tree_.roots();
   for (std::size_t next = 0; next < queue.size(); ++next) {
     const int c = queue[next];
-    Prefetch(queue, next);
     Clique& clique = tree_.clique(c);
     bool needed = clique.unsolved;
     for (std::size_t i = clique.num_frontal; !needed && i < clique.variables.size(); ++i) {
       needed = variable_stamp_[clique.variables[i]] == stamp_;
     }
-    if (!needed) continue;
+    if (!needed) {
+      Prefetch(queue, next);
+      continue;
+    }
+    queue.insert(queue.end(), clique.children.begin(), clique.children.end());
+    Prefetch(queue, next);
     x_.resize(std::max(x_.size(),
                        static_cast<std::size_t>(clique.frontal_dimension + clique.separator_dimension)));
     tree_.SolveClique(clique, x_.data());
@@ -635,20 +633,21 @@ void IncrementalSolver::Impl::Solve(double publish_threshold, double still_thres
         publish = publish || std::abs(x[k] - v.published[k]) > publish_threshold * unit;
       }
       if (moved) {
-        step->variables.push_back(slot);
-        step->delta.insert(step->delta.end(), std::begin(v.delta), std::end(v.delta));
-        step->published.insert(step->published.end(), std::begin(v.published), std::end(v.published));
+        step->moves.emplace_back();
+        Move& move = step->moves.back();
+        move.variable = slot;
+        std::copy_n(v.delta, kMaxTangentDimension, move.before);
+        std::copy_n(v.published, kMaxTangentDimension, move.published_before);
+        std::copy_n(x, v.dimension, v.delta);
+        std::copy_n(v.delta, kMaxTangentDimension, move.after);
         VariableRecord& record = variables[slot];
-        step->estimate.push_back(record.estimate);
-        std::copy(x, x + v.dimension, v.delta);
-        step->moved.insert(step->moved.end(), std::begin(v.delta), std::end(v.delta));
-        record.estimate = Retract(record.theta, v.delta);
+        Retract(record.theta, v.delta, &record.estimate);
         if (!has_moved_[slot]) {
           has_moved_[slot] = 1;
           moved_.push_back(slot);
         }
         if (publish) {
-          std::copy(x, x + v.dimension, v.published);
+          std::copy_n(x, v.dimension, v.published);
           variable_stamp_[slot] = stamp_;
         }
       }
@@ -656,10 +655,9 @@ void IncrementalSolver::Impl::Solve(double publish_threshold, double still_thres
     }
     clique.unsolved = false;
     step->cliques.push_back(c);
-    queue.insert(queue.end(), clique.children.begin(), clique.children.end());
   }
-  for (const int slot : step->variables) {
-    for (const int f : variables[slot].factors) {
+  for (const Move& move : step->moves) {
+    for (const int f : variables[move.variable].factors) {
       if (factor_stamp_[f] == stamp_) continue;
       factor_stamp_[f] = stamp_;
       step->factors.push_back(f);
@@ -670,12 +668,11 @@ void IncrementalSolver::Impl::Solve(double publish_threshold, double still_thres
 }
 
 void IncrementalSolver::Impl::Undo(const Step& step) {
-  for (std::size_t i = 0; i < step.variables.size(); ++i) {
-    VariableState& v = graph_.states[step.variables[i]];
-    const auto offset = static_cast<long>(i) * kMaxTangentDimension;
-    std::copy_n(step.delta.begin() + offset, kMaxTangentDimension, v.delta);
-    std::copy_n(step.published.begin() + offset, kMaxTangentDimension, v.published);
-    graph_.variables[step.variables[i]].estimate = step.estimate[i];
+  for (const Move& move : step.moves) {
+    VariableState& v = graph_.states[move.variable];
+    std::copy_n(move.before, kMaxTangentDimension, v.delta);
+    std::copy_n(move.published_before, kMaxTangentDimension, v.published);
+    MoveEstimate(move.variable);
   }
   for (std::size_t i = 0; i < step.factors.size(); ++i) SetError(step.factors[i], step.errors[i]);
   for (const int c : step.cliques) tree_.clique(c).unsolved = true;
@@ -683,15 +680,25 @@ void IncrementalSolver::Impl::Undo(const Step& step) {
 
 // Takes only a part of an undone step. Its cliques stay unsolved: the next step starts from here.
 void IncrementalSolver::Impl::Shorten(const Step& step, double fraction) {
-  for (std::size_t i = 0; i < step.variables.size(); ++i) {
-    VariableState& v = graph_.states[step.variables[i]];
-    VariableRecord& record = graph_.variables[step.variables[i]];
-    const double* before = step.delta.data() + i * kMaxTangentDimension;
-    const double* after = step.moved.data() + i * kMaxTangentDimension;
-    for (int k = 0; k < v.dimension; ++k) v.delta[k] = before[k] + fraction * (after[k] - before[k]);
-    record.estimate = Retract(record.theta, v.delta);
+  for (const Move& move : step.moves) {
+    VariableState& v = graph_.states[move.variable];
+    for (int k = 0; k < v.dimension; ++k) {
+      v.delta[k] = move.before[k] + fraction * (move.after[k] - move.before[k]);
+    }
+    MoveEstimate(move.variable);
   }
   EvaluateErrors(step.factors);
+}
+
+// The estimate to its tangent coordinates; exactly to the linearisation point for none.
+void IncrementalSolver::Impl::MoveEstimate(int slot) {
+  VariableRecord& record = graph_.variables[slot];
+  const double* delta = graph_.states[slot].delta;
+  if (std::all_of(delta, delta + kMaxTangentDimension, [](double d) { return d == 0.0; })) {
+    record.estimate = record.theta;
+  } else {
+    Retract(record.theta, delta, &record.estimate);
+  }
 }
 
 // A new tree over the whole graph at the present linearisation points, without damping.
@@ -909,11 +916,11 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
       // Once more from the present estimate, linearised there, with more damping.
       if (result.steps_refused == 1) {
         std::vector<int> stale;
-        for (const int v : step.variables) {
-          const VariableState& state = graph_.states[v];
+        for (const Move& move : step.moves) {
+          const VariableState& state = graph_.states[move.variable];
           for (int k = 0; k < state.dimension; ++k) {
             if (state.delta[k] != 0.0) {
-              stale.push_back(v);
+              stale.push_back(move.variable);
               break;
             }
           }
