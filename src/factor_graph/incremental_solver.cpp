@@ -741,6 +741,14 @@ void IncrementalSolver::Impl::RestoreTree() {
 
 void IncrementalSolver::Impl::ThrowUnderconstrained(int slot) const {
   const Key key = graph_.variables[slot].key;
+  for (const int f : graph_.variables[slot].factors) {
+    const FactorRecord& record = graph_.factors[f];
+    if (std::all_of(record.hessian.begin(), record.hessian.end(), [](double x) { return std::isfinite(x); })) {
+      continue;
+    }
+    throw NonFiniteError(key, record.factor->Describe() + ": its derivative at " + KeyName(key) +
+                                  " is not finite; check the measurement and the initial values");
+  }
   // The part of the graph that hangs together with the variable.
   std::vector<char> seen(graph_.variables.size(), 0);
   std::vector<int> part = {slot};
