@@ -359,7 +359,17 @@ bool BayesTree::FactorizeClique(Clique* clique, const Damping& damping, int* fai
     offset += states[v].dimension;
   }
   for (int i = 0; i < clique->num_frontal; ++i) AddUnary(clique->variables[i], stride, rhs);
-  for (const int f : clique->factors) AddFactor(graph_->factors[f], stride, rhs);
+  // What is summed lies scattered in memory, so the next is fetched while one is added.
+  const std::vector<int>& factors = clique->factors;
+  for (std::size_t i = 0; i < factors.size(); ++i) {
+    if (i + 2 < factors.size()) PrefetchLines(&graph_->factors[factors[i + 2]], sizeof(FactorRecord));
+    if (i + 1 < factors.size()) {
+      const FactorRecord& next = graph_->factors[factors[i + 1]];
+      PrefetchLines(next.hessian.data(), next.hessian.size() * sizeof(double));
+      PrefetchLines(next.variables.data(), 1);
+    }
+    AddFactor(graph_->factors[factors[i]], stride, rhs);
+  }
   for (const int child : clique->children) AddMarginal(cliques_[child], stride, rhs);
 
   limits_.resize(std::max(limits_.size(), static_cast<std::size_t>(frontal)));

@@ -7,7 +7,7 @@
 
 namespace dendro {
 
-Vector6d BetweenResidual(const Eigen::Isometry3d& T_to_from_measured,
+Vector6d BetweenResidual(const Eigen::Isometry3d& T_from_to_measured,
                          const Eigen::Isometry3d& T_from,
                          const Eigen::Isometry3d& T_to,
                          Matrix6d* J_from,
@@ -15,10 +15,11 @@ Vector6d BetweenResidual(const Eigen::Isometry3d& T_to_from_measured,
   const Eigen::Matrix3d R_from_to = T_from.linear().transpose() * T_to.linear();
   const Eigen::Vector3d t_from_to =
       T_from.linear().transpose() * (T_to.translation() - T_from.translation());
-  Eigen::Isometry3d E = Eigen::Isometry3d::Identity();
-  E.linear() = T_to_from_measured.linear() * R_from_to;
-  E.translation() = T_to_from_measured.linear() * t_from_to + T_to_from_measured.translation();
-  const Vector6d r = LogSe3(E);
+  const auto R_measured = T_from_to_measured.linear();
+  const Eigen::Matrix3d R = R_measured.transpose() * R_from_to;
+  const Eigen::Vector3d t =
+      R_measured.transpose() * (t_from_to - T_from_to_measured.translation());
+  const Vector6d r = LogSe3(R, t);
   if (J_from == nullptr) return r;
 
   // d r / d to = JrInv(r); moving `from` by d moves `to` in its frame by -Ad(T_to_from) d.
@@ -40,9 +41,7 @@ BetweenFactor::BetweenFactor(Key from,
                              Key to,
                              const Eigen::Isometry3d& T_from_to,
                              const NoiseModel& noise)
-    : TypedFactor(noise, from, to),
-      T_from_to_(T_from_to),
-      T_to_from_(T_from_to.inverse(Eigen::Isometry)) {
+    : TypedFactor(noise, from, to), T_from_to_(T_from_to) {
   const std::string name = "between " + KeyName(from) + " " + KeyName(to);
   if (!IsValid(Value(T_from_to))) throw std::invalid_argument(name + ": the motion is not a valid pose");
   if (noise.dimension() != 6) throw std::invalid_argument(name + ": the noise must have dimension 6");
@@ -54,11 +53,11 @@ void BetweenFactor::Evaluate(const Value* const* values, double* residual, doubl
   const auto& T_to = *std::get_if<Eigen::Isometry3d>(values[1]);
   Eigen::Map<Vector6d> r(residual);
   if (jacobian == nullptr) {
-    r = BetweenResidual(T_to_from_, T_from, T_to, nullptr, nullptr);
+    r = BetweenResidual(T_from_to_, T_from, T_to, nullptr, nullptr);
     return;
   }
   Matrix6d J_from, J_to;
-  r = BetweenResidual(T_to_from_, T_from, T_to, &J_from, &J_to);
+  r = BetweenResidual(T_from_to_, T_from, T_to, &J_from, &J_to);
   Eigen::Map<Eigen::Matrix<double, 6, 12>> J(jacobian);
   J << J_from, J_to;
 }

@@ -1,10 +1,11 @@
 #include "dendro_slam/factor_graph/g2o.h"
 
 #include <cmath>
-#include <istream>
 #include <iomanip>
+#include <istream>
 #include <limits>
 #include <ostream>
+#include <set>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -19,27 +20,39 @@ namespace dendro {
 
 namespace {
 
-[[noreturn]] void Fail(int line, const std::string& what) {
-  throw std::runtime_error("line " + std::to_string(line) + ": " + what);
-}
+// One line of the file, and what it is about ("vertex 3", "edge 3 4") as soon as that is known.
+struct Line {
+  int number = 0;
+  std::istringstream fields;
+  std::string subject;
 
-double ReadNumber(std::istringstream& in, int line) {
+  [[noreturn]] void Fail(const std::string& what) const {
+    throw std::runtime_error("line " + std::to_string(number) + ": " +
+                             (subject.empty() ? "" : subject + ": ") + what);
+  }
+};
+
+double ReadNumber(Line* line) {
   double x = 0.0;
-  if (!(in >> x) || !std::isfinite(x)) Fail(line, "a number is missing or not finite");
+  if (!(line->fields >> x) || !std::isfinite(x)) {
+    line->Fail("a number is missing or not finite; correct the line or take it out");
+  }
   return x;
 }
 
-std::int64_t ReadId(std::istringstream& in, int line) {
+std::int64_t ReadId(Line* line) {
   std::int64_t id = 0;
-  if (!(in >> id) || id < 0) Fail(line, "a vertex id is missing or negative");
+  if (!(line->fields >> id) || id < 0 || static_cast<std::uint64_t>(id) > kKeyIndexMask) {
+    line->Fail("a vertex id is missing, negative or above 2^56 - 1; number the vertices from 0");
+  }
   return id;
 }
 
-Eigen::Isometry3d ReadPose(std::istringstream& in, int line) {
+Eigen::Isometry3d ReadPose(Line* line) {
   double v[7];
-  for (double& x : v) x = ReadNumber(in, line);
+  for (double& x : v) x = ReadNumber(line);
   const Eigen::Quaterniond q(v[6], v[3], v[4], v[5]);
-  if (q.norm() < 1e-6) Fail(line, "the quaternion is zero");
+  if (q.norm() < 1e-6) line->Fail("the quaternion is zero; 0 0 0 1 is no rotation");
   Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
   T.linear() = q.normalized().toRotationMatrix();
   T.translation() << v[0], v[1], v[2];
@@ -72,44 +85,86 @@ Eigen::Matrix3d NearestRotation(const Eigen::Matrix3d& M) {
 
 PoseGraph ReadG2o(std::istream& in) {
   PoseGraph graph;
+  std::vector<int> edge_lines;
   std::string text;
-  for (int line = 1; std::getline(in, text); ++line) {
-    std::istringstream fields(text);
+  for (int number = 1; std::getline(in, text); ++number) {
+    Line line;
+    line.number = number;
+    line.fields.str(text);
     std::string tag;
-    if (!(fields >> tag) || tag[0] == '#' || tag == "FIX") continue;
+    if (!(line.fields >> tag) || tag[0] == '#' || tag == "FIX") continue;
     if (tag == "VERTEX_SE3:QUAT") {
-      const std::int64_t id = ReadId(fields, line);
-      const Eigen::Isometry3d pose = ReadPose(fields, line);
-      if (!graph.poses.emplace(id, pose).second) {
-        Fail(line, "vertex " + std::to_string(id) + " is given twice");
-      }
+      const std::int64_t id = ReadId(&line);
+      line.subject = "vertex " + std::to_string(id);
+      const Eigen::Isometry3d pose = ReadPose(&line);
+      if (!graph.poses.emplace(id, pose).second) line.Fail("given twice; take one of them out");
     } else if (tag == "EDGE_SE3:QUAT") {
       PoseGraphEdge edge;
-      edge.from = ReadId(fields, line);
-      edge.to = ReadId(fields, line);
-      if (edge.from == edge.to) Fail(line, "an edge joins a vertex with itself");
-      edge.T_from_to = ReadPose(fields, line);
+      edge.from = ReadId(&line);
+      edge.to = ReadId(&line);
+      line.subject = "edge " + std::to_string(edge.from) + " " + std::to_string(edge.to);
+      if (edge.from == edge.to) line.Fail("joins a vertex with itself; take it out");
+      edge.T_from_to = ReadPose(&line);
       Matrix6d information;
       for (int r = 0; r < 6; ++r) {
-        for (int c = r; c < 6; ++c) {
-          information(r, c) = information(c, r) = ReadNumber(fields, line);
-        }
+        for (int c = r; c < 6; ++c) information(r, c) = information(c, r) = ReadNumber(&line);
       }
       edge.information = SwapBlocks(information);
       if (Eigen::LLT<Matrix6d>(edge.information).info() != Eigen::Success) {
-        Fail(line, "the information matrix is not positive definite");
+        line.Fail("the information matrix is not positive definite; give a direction that was not "
+                  "measured a small information, not none");
       }
       graph.edges.push_back(edge);
+      edge_lines.push_back(number);
     } else {
-      Fail(line, "tag " + tag + " is not VERTEX_SE3:QUAT or EDGE_SE3:QUAT");
+      line.Fail("tag " + tag + " is not VERTEX_SE3:QUAT or EDGE_SE3:QUAT; only SE(3) pose graphs are read");
     }
   }
-  for (const PoseGraphEdge& edge : graph.edges) {
-    graph.poses.emplace(edge.from, Eigen::Isometry3d::Identity());
-    graph.poses.emplace(edge.to, Eigen::Isometry3d::Identity());
+  const bool has_vertices = !graph.poses.empty();
+  for (std::size_t i = 0; i < graph.edges.size(); ++i) {
+    const PoseGraphEdge& edge = graph.edges[i];
+    for (const std::int64_t id : {edge.from, edge.to}) {
+      if (!graph.poses.emplace(id, Eigen::Isometry3d::Identity()).second || !has_vertices) continue;
+      throw UnknownVariableError(
+          PoseGraphKey(id),
+          "line " + std::to_string(edge_lines[i]) + ": edge " + std::to_string(edge.from) + " " +
+              std::to_string(edge.to) + ": vertex " + std::to_string(id) +
+              " has no VERTEX_SE3:QUAT line; add one or take the edge out");
+    }
   }
-  if (graph.poses.empty()) throw std::runtime_error("the file holds no SE(3) vertex");
+  if (graph.poses.empty()) {
+    throw std::runtime_error("the file holds no SE(3) vertex; it needs VERTEX_SE3:QUAT or EDGE_SE3:QUAT lines");
+  }
   return graph;
+}
+
+std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph) {
+  std::map<std::int64_t, std::vector<std::int64_t>> neighbours;
+  for (const PoseGraphEdge& edge : graph.edges) {
+    neighbours[edge.from].push_back(edge.to);
+    neighbours[edge.to].push_back(edge.from);
+  }
+  std::vector<std::int64_t> order;
+  std::set<std::int64_t> reached = {graph.poses.begin()->first};
+  std::set<std::int64_t> next = reached;
+  while (!next.empty()) {
+    const std::int64_t id = *next.begin();
+    next.erase(next.begin());
+    order.push_back(id);
+    for (const std::int64_t other : neighbours[id]) {
+      if (reached.insert(other).second) next.insert(other);
+    }
+  }
+  for (const auto& entry : graph.poses) {
+    if (reached.count(entry.first) != 0) continue;
+    const Key key = PoseGraphKey(entry.first);
+    throw UnderconstrainedError(
+        key, "variable " + KeyName(key) + " is under-constrained: no path of edges leads from it to the first pose, " +
+                 KeyName(PoseGraphKey(order.front())) + " (" + std::to_string(order.size()) + " of " +
+                 std::to_string(graph.poses.size()) +
+                 " poses are joined to that); add an edge between the two parts, or solve them as two graphs");
+  }
+  return order;
 }
 
 void WriteG2o(const PoseGraph& graph, std::ostream& out) {
@@ -145,6 +200,7 @@ FactorList PoseGraphFactors(const PoseGraph& graph) {
 }
 
 std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph& graph) {
+  InsertionOrder(graph);  // Throws unless all hang together.
   std::map<std::int64_t, int> index;
   for (const auto& entry : graph.poses) index.emplace(entry.first, static_cast<int>(index.size()) - 1);
   const int n = static_cast<int>(index.size()) - 1;  // The first pose is known and has index -1.
@@ -162,7 +218,8 @@ std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph&
     H.setFromTriplets(triplets.begin(), triplets.end());
     solver.compute(H);
     if (solver.info() != Eigen::Success || !(solver.vectorD().minCoeff() > 0.0)) {
-      throw std::runtime_error("the pose graph is not connected");
+      throw std::runtime_error("the linear system of the initialisation has no unique solution although the graph "
+                               "is connected; the information matrices of the edges differ too much in size");
     }
     return Eigen::MatrixXd(solver.solve(rhs));
   };

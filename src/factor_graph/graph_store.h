@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <vector>
 
@@ -47,6 +48,19 @@ struct GraphStore {
   std::vector<VariableRecord> variables;
   std::vector<FactorRecord> factors;
 };
+
+/// Asks for memory that will be read soon; has no other effect.
+inline void PrefetchLines(const void* memory, std::size_t bytes) {
+#ifdef __GNUC__
+  constexpr std::size_t kLine = 64;
+  for (std::size_t at = 0; at < bytes; at += kLine) {
+    __builtin_prefetch(static_cast<const char*>(memory) + at);
+  }
+#else
+  static_cast<void>(memory);
+  static_cast<void>(bytes);
+#endif
+}
 
 /// Index of entry (row, column), row >= column, in a packed lower triangle of `size` columns.
 inline std::size_t PackedIndex(int row, int column, int size) {

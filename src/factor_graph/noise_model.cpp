@@ -54,6 +54,13 @@ void WhitenColumns(const NoiseModel::Matrix& sqrt_information, double scale, dou
   }
 }
 
+template <int N>
+double WhitenedNorm(const NoiseModel::Matrix& sqrt_information, const double* residual) {
+  const Eigen::Map<const Eigen::Matrix<double, N, N>> W(sqrt_information.data());
+  const Eigen::Map<const Eigen::Matrix<double, N, 1>> r(residual);
+  return (W * r).squaredNorm();
+}
+
 void WhitenAny(const NoiseModel::Matrix& W, bool diagonal, double scale, double* m, int columns) {
   const int n = static_cast<int>(W.rows());
   if (diagonal) {
@@ -182,6 +189,14 @@ double NoiseModel::SquaredMahalanobis(const double* residual) const {
       sum += w * w;
     }
     return sum;
+  }
+  switch (n) {
+    case 5:
+      return WhitenedNorm<5>(sqrt_information_, residual);
+    case 6:
+      return WhitenedNorm<6>(sqrt_information_, residual);
+    default:
+      break;
   }
   double whitened[kMaxDimension];
   for (int r = 0; r < n; ++r) whitened[r] = residual[r];

@@ -35,20 +35,30 @@ int TangentDimension(const Value& value) {
 }
 
 Value Retract(const Value& value, const double* delta) {
-  if (const auto* pose = std::get_if<Eigen::Isometry3d>(&value)) {
-    const Eigen::Isometry3d step = ExpSe3(Map6(delta));
-    Eigen::Isometry3d out = Eigen::Isometry3d::Identity();
-    out.linear() = pose->linear() * step.linear();
-    out.translation() = pose->linear() * step.translation() + pose->translation();
-    return out;
-  }
-  if (const auto* cylinder = std::get_if<Cylinder>(&value)) return cylinder->Retract(Map5(delta));
-  if (const auto* point = std::get_if<Eigen::Vector3d>(&value)) {
-    return Eigen::Vector3d(*point + Map3(delta));
-  }
-  PointN out = *std::get_if<PointN>(&value);
-  for (int i = 0; i < out.size(); ++i) out[i] += delta[i];
+  Value out = value;
+  Retract(value, delta, &out);
   return out;
+}
+
+void Retract(const Value& value, const double* delta, Value* out) {
+  if (out->index() != value.index()) *out = value;
+  if (const auto* pose = std::get_if<Eigen::Isometry3d>(&value)) {
+    auto& moved = *std::get_if<Eigen::Isometry3d>(out);
+    const Eigen::Isometry3d step = ExpSe3(Map6(delta));
+    const Eigen::Matrix3d R = pose->linear() * step.linear();
+    const Eigen::Vector3d t = pose->linear() * step.translation() + pose->translation();
+    moved.linear() = R;
+    moved.translation() = t;
+  } else if (const auto* cylinder = std::get_if<Cylinder>(&value)) {
+    *std::get_if<Cylinder>(out) = cylinder->Retract(Map5(delta));
+  } else if (const auto* point = std::get_if<Eigen::Vector3d>(&value)) {
+    *std::get_if<Eigen::Vector3d>(out) = *point + Map3(delta);
+  } else {
+    const PointN& from = *std::get_if<PointN>(&value);
+    PointN& moved = *std::get_if<PointN>(out);
+    moved = from;
+    for (int i = 0; i < moved.size(); ++i) moved[i] += delta[i];
+  }
 }
 
 void LocalCoordinates(const Value& from, const Value& to, double* delta) {

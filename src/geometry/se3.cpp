@@ -10,6 +10,9 @@ namespace dendro {
 
 namespace {
 
+// Below this squared angle the series of ExpSe3 are exact to rounding.
+constexpr double kSeriesAngleSquared = 0.01;
+
 // Left Jacobian of SO(3): the V of Exp, translation = V rho.
 Eigen::Matrix3d LeftJacobianSo3(const Eigen::Vector3d& omega) { return RightJacobianSo3(-omega); }
 
@@ -39,19 +42,44 @@ Eigen::Matrix3d LeftQ(const Eigen::Vector3d& omega, const Eigen::Vector3d& rho) 
 
 }  // namespace
 
+// Both series share W and W^2: R = I + a W + b W^2, V = I + b W + c W^2 with a = sin(theta) / theta,
+// b = (1 - cos(theta)) / theta^2, c = (theta - sin(theta)) / theta^3.
 Eigen::Isometry3d ExpSe3(const Vector6d& xi) {
-  Eigen::Isometry3d T = Eigen::Isometry3d::Identity();
-  T.linear() = ExpSo3(xi.head<3>());
-  T.translation() = LeftJacobianSo3(xi.head<3>()) * xi.tail<3>();
+  const Eigen::Vector3d omega = xi.head<3>();
+  const Eigen::Vector3d rho = xi.tail<3>();
+  const double theta2 = omega.squaredNorm();
+  double a, b, c;
+  if (theta2 < kSeriesAngleSquared) {
+    a = 1.0 - theta2 / 6.0 * (1.0 - theta2 / 20.0 * (1.0 - theta2 / 42.0 * (1.0 - theta2 / 72.0)));
+    b = 0.5 * (1.0 - theta2 / 12.0 * (1.0 - theta2 / 30.0 * (1.0 - theta2 / 56.0 * (1.0 - theta2 / 90.0))));
+    c = (1.0 - theta2 / 20.0 * (1.0 - theta2 / 42.0 * (1.0 - theta2 / 72.0 * (1.0 - theta2 / 110.0)))) / 6.0;
+  } else {
+    const double theta = std::sqrt(theta2);
+    const double half_sin = std::sin(0.5 * theta);
+    const double sin = std::sin(theta);
+    a = sin / theta;
+    b = 2.0 * half_sin * half_sin / theta2;
+    c = (theta - sin) / (theta2 * theta);
+  }
+  const double x = omega.x(), y = omega.y(), z = omega.z();
+  const double bxy = b * x * y, bxz = b * x * z, byz = b * y * z;
+  Eigen::Isometry3d T;
+  T.matrix() << 1.0 - b * (y * y + z * z), bxy - a * z, bxz + a * y, 0.0,
+      bxy + a * z, 1.0 - b * (x * x + z * z), byz - a * x, 0.0,
+      bxz - a * y, byz + a * x, 1.0 - b * (x * x + y * y), 0.0,
+      0.0, 0.0, 0.0, 1.0;
+  const Eigen::Vector3d u = omega.cross(rho);
+  T.translation() = rho + b * u + c * omega.cross(u);
   return T;
 }
 
-Vector6d LogSe3(const Eigen::Isometry3d& T) {
+Vector6d LogSe3(const Eigen::Isometry3d& T) { return LogSe3(T.linear(), T.translation()); }
+
+Vector6d LogSe3(const Eigen::Matrix3d& R, const Eigen::Vector3d& t) {
   Vector6d xi;
-  xi.head<3>() = LogSo3(T.linear());
+  const Eigen::Vector3d omega = LogSo3(R);
+  xi.head<3>() = omega;
   // Jl(omega)^-1 t, by cross products.
-  const Eigen::Vector3d omega = xi.head<3>();
-  const Eigen::Vector3d t = T.translation();
   const Eigen::Vector3d u = omega.cross(t);
   xi.tail<3>() =
       t - 0.5 * u + internal::InverseJacobianCoefficient(omega.squaredNorm()) * omega.cross(u);

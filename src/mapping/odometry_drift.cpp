@@ -47,11 +47,11 @@ void DriftingMotionFactor::Evaluate(const Value* const* values,
   const Eigen::Isometry3d T_measured = Without(*std::get_if<PointN>(values[2]));
   Eigen::Map<Vector6d> r(residual);
   if (jacobian == nullptr) {
-    r = BetweenResidual(T_measured.inverse(Eigen::Isometry), T_from, T_to, nullptr, nullptr);
+    r = BetweenResidual(T_measured, T_from, T_to, nullptr, nullptr);
     return;
   }
   Matrix6d J_from, J_to;
-  r = BetweenResidual(T_measured.inverse(Eigen::Isometry), T_from, T_to, &J_from, &J_to);
+  r = BetweenResidual(T_measured, T_from, T_to, &J_from, &J_to);
   Eigen::Map<Eigen::Matrix<double, 6, 12 + kDriftDimension>> J(jacobian);
   J.leftCols<6>() = J_from;
   J.middleCols<6>(6) = J_to;

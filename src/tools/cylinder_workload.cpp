@@ -20,6 +20,7 @@
 #include "dendro_slam/factor_graph/incremental_solver.h"
 #include "dendro_slam/factor_graph/junction_point_factor.h"
 #include "dendro_slam/factor_graph/prior_factor.h"
+#include "dendro_slam/factor_graph/scan_summary.h"
 #include "dendro_slam/geometry/se3.h"
 #include "measure.h"
 
@@ -50,7 +51,9 @@ struct Options {
   int seen = 12;               // Cylinders observed from a pose: the nearest ones.
   int seed = 1;
   double key_frame_hz = kScanRateHz;
-  bool consolidate = false;    // Scans between key frames are marginalised instead of dropped.
+  // What becomes of the scans between key frames: "drop"; "summarize": one cylinder factor per landmark on
+  // the next key frame; "marginalize": poses of the graph until the next key frame is there.
+  std::string between = "drop";
   std::string landmarks = "cylinders";
   std::string write;           // The same measurements for another solver.
 };
@@ -101,7 +104,7 @@ Run Simulate(const Options& options) {
     c.curvature = 1.0 / (0.04 + 0.16 * uniform(rng));
     run.truth.push_back(c);
   }
-  const int stride = options.consolidate ? 1 : KeyFrameStride(options);
+  const int stride = options.between == "drop" ? KeyFrameStride(options) : 1;
   const int count = static_cast<int>(std::lround(options.minutes * 60.0 * kScanRateHz));
   // Between key frames the odometry's errors add up.
   run.odometry_sigma << Vector3d::Constant(kOdometryRotationSigma), Vector3d::Constant(kOdometryTranslationSigma);
@@ -226,8 +229,11 @@ int main(int argc, char** argv) {
   app.add_option("--key-frame-hz", options.key_frame_hz, "Poses per second")
       ->capture_default_str()
       ->check(CLI::Range(0.1, kScanRateHz));
-  app.add_flag("--consolidate", options.consolidate,
-               "Scans between key frames are marginalised once the next key frame is there, instead of dropped");
+  app.add_option("--between", options.between,
+                 "Scans between key frames. drop: not used; summarize: become one cylinder factor per landmark of the "
+                 "next key frame; marginalize: stay poses until then and leave one dense factor")
+      ->capture_default_str()
+      ->check(CLI::IsMember({"drop", "summarize", "marginalize"}));
   app.add_option("--landmarks", options.landmarks,
                  "cylinders: one factor of 5 residuals an observation; parts: axis, normal and curvature factor each on "
                  "its own; points: both ends as points, which other solvers know too")
@@ -251,16 +257,23 @@ int main(int argc, char** argv) {
     std::size_t relinearized = 0;
     std::size_t reeliminated = 0;
     int refused = 0;
+    // Not yet in the graph: the factors of the scans since the last key frame, and where they stand.
+    FactorList pending;
+    dendro::Values pending_poses;
+    Isometry3d T = run.first;
+    std::size_t key_frame = 0;
+    const std::size_t stride = options.between == "drop" ? 1 : static_cast<std::size_t>(KeyFrameStride(options));
     for (std::size_t k = 0; k < run.scans.size(); ++k) {
       const Scan& scan = run.scans[k];
       FactorList factors;
       dendro::Values values;
-      Isometry3d T = run.first;
+      dendro::UpdateOptions update_options;
       if (k == 0) {
         factors.push_back(
             std::make_shared<dendro::PosePrior>(PoseKey(0), run.first, NoiseModel::Isotropic(6, kPriorSigma)));
       } else {
-        T = solver.Estimate<Isometry3d>(PoseKey(k - 1)) * scan.odometry;
+        if (solver.Contains(PoseKey(k - 1))) T = solver.Estimate<Isometry3d>(PoseKey(k - 1));
+        T = T * scan.odometry;
         factors.push_back(std::make_shared<dendro::BetweenFactor>(PoseKey(k - 1), PoseKey(k), scan.odometry,
                                                                   NoiseModel::Sigmas(run.odometry_sigma)));
       }
@@ -268,13 +281,26 @@ int main(int argc, char** argv) {
       for (const Scan::Observation& o : scan.observations) {
         AddObservation(options, run, PoseKey(k), T, o, solver, &factors, &values);
       }
-      // The scans before the last key frame leave the graph with the next scan's update.
-      dendro::UpdateOptions update_options;
-      const auto interval = static_cast<std::size_t>(KeyFrameStride(options));
-      if (options.consolidate && interval > 1 && k > 1 && (k - 1) % interval == 0) {
-        for (std::size_t i = k - interval; i + 1 < k; ++i) update_options.marginalize.push_back(PoseKey(i));
-      }
       const double start = dendro::measure::ThreadCpuSeconds();
+      if (options.between == "summarize" && k > 0) {
+        pending.insert(pending.end(), factors.begin(), factors.end());
+        pending_poses.Insert(PoseKey(k), T);
+        if (k % stride != 0) continue;
+        pending_poses.Insert(PoseKey(key_frame), solver.Estimate<Isometry3d>(PoseKey(key_frame)));
+        factors = dendro::SummarizeScans(PoseKey(key_frame), PoseKey(k), pending, pending_poses).factors;
+        // Landmarks that only a scan between saw are new as well.
+        for (const dendro::FactorPtr& factor : factors) {
+          const auto* seen = dynamic_cast<const dendro::CylinderFactor*>(factor.get());
+          if (seen == nullptr || solver.Contains(seen->keys()[1]) || values.Contains(seen->keys()[1])) continue;
+          values.Insert(seen->keys()[1], dendro::TransformCylinder(T, seen->measured()));
+        }
+        pending.clear();
+        pending_poses = {};
+        key_frame = k;
+      } else if (options.between == "marginalize" && stride > 1 && k > 1 && (k - 1) % stride == 0) {
+        // The scans before the last key frame leave the graph with the next scan's update.
+        for (std::size_t i = k - stride; i + 1 < k; ++i) update_options.marginalize.push_back(PoseKey(i));
+      }
       const dendro::UpdateResult result = solver.Update(factors, values, update_options);
       seconds.push_back(dendro::measure::ThreadCpuSeconds() - start);
       relinearized += result.variables_relinearized;
@@ -295,7 +321,7 @@ int main(int argc, char** argv) {
     report["total_cpu_s"] = total;
     report["p99_ms"] = 1e3 * dendro::measure::Quantile(seconds, 0.99);
     const auto per_minute = static_cast<std::size_t>(
-        std::lround(60.0 * static_cast<double>(run.scans.size()) / (options.minutes * 60.0)));
+        std::lround(static_cast<double>(seconds.size()) / options.minutes));
     for (std::size_t begin = 0; begin < seconds.size(); begin += per_minute) {
       const std::vector<double> part(seconds.begin() + static_cast<long>(begin),
                                      seconds.begin() + static_cast<long>(std::min(begin + per_minute, seconds.size())));
@@ -310,12 +336,18 @@ int main(int argc, char** argv) {
     report["peak_memory_before_mb"] = memory_before_mb;
     if (options.landmarks != "points") {
       double worst = 0.0;
+      Vector5d squares = Vector5d::Zero();
+      int mapped = 0;
       for (int i = 0; i < options.cylinders; ++i) {
         if (!solver.Contains(LandmarkKey(i))) continue;
         const double radius = solver.Estimate<Cylinder>(LandmarkKey(i)).radius();
         report["radii_m"].push_back(radius);
         worst = std::max(worst, std::abs(radius - run.truth[i].radius()));
+        squares += run.truth[i].LocalCoordinates(solver.Estimate<Cylinder>(LandmarkKey(i))).cwiseAbs2();
+        ++mapped;
       }
+      report["axis_error_rms_rad"] = std::sqrt(squares.head<2>().sum() / std::max(1, mapped));
+      report["offset_error_rms_m"] = std::sqrt(squares.segment<2>(2).sum() / std::max(1, mapped));
       report["radius_error_max_m"] = worst;
     }
     if (!trace_file.empty()) {

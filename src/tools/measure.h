@@ -1,10 +1,10 @@
 #pragma once
 
-#include <sys/resource.h>
-
 #include <algorithm>
 #include <cstddef>
 #include <ctime>
+#include <fstream>
+#include <string>
 #include <vector>
 
 /// What the benchmark programs measure with. Processor time, unlike the clock on the wall, does not
@@ -23,11 +23,15 @@ inline double ThreadCpuSeconds() { return ClockSeconds(CLOCK_THREAD_CPUTIME_ID);
 /// Processor time of all threads of this process so far [s].
 inline double ProcessCpuSeconds() { return ClockSeconds(CLOCK_PROCESS_CPUTIME_ID); }
 
-/// Most memory that this process has held so far [MB of 2^20 bytes].
+/// Most memory that this process has held so far [MB of 2^20 bytes]; 0 where /proc does not tell. (Not
+/// getrusage: its figure starts with the peak of the process that started this one.)
 inline double PeakMemoryMb() {
-  rusage usage{};
-  getrusage(RUSAGE_SELF, &usage);
-  return static_cast<double>(usage.ru_maxrss) / 1024.0;
+  std::ifstream status("/proc/self/status");
+  for (std::string word; status >> word;) {
+    double kilobytes = 0.0;
+    if (word == "VmHWM:" && status >> kilobytes) return kilobytes / 1024.0;
+  }
+  return 0.0;
 }
 
 /// The value below which the part `q`, in [0, 1], of the values lies, interpolated; 0 without values.

@@ -85,23 +85,27 @@ Summary SolveBatch(const PoseGraph& graph, bool chordal, dendro::IncrementalSolv
 Summary SolveIncrementally(const PoseGraph& graph, bool progress, dendro::IncrementalSolver* solver) {
   Summary summary;
   const FactorList all = dendro::PoseGraphFactors(graph);
-  std::map<std::int64_t, std::vector<std::size_t>> edges_of;
+  const std::vector<std::int64_t> order = dendro::InsertionOrder(graph);
+  std::map<std::int64_t, std::size_t> place;
+  for (std::size_t i = 0; i < order.size(); ++i) place[order[i]] = i;
+  // An edge comes with the later of its poses.
+  std::vector<std::vector<std::size_t>> edges_of(order.size());
   for (std::size_t i = 0; i < graph.edges.size(); ++i) {
-    edges_of[std::max(graph.edges[i].from, graph.edges[i].to)].push_back(i);
+    edges_of[std::max(place[graph.edges[i].from], place[graph.edges[i].to])].push_back(i);
   }
   const auto start = std::chrono::steady_clock::now();
   std::size_t done = 0;
-  for (const auto& [id, file_pose] : graph.poses) {
+  for (const std::int64_t id : order) {
     FactorList factors;
     dendro::Values values;
-    Eigen::Isometry3d pose = file_pose;
-    std::int64_t latest = -1;
-    for (const std::size_t i : edges_of[id]) {
+    Eigen::Isometry3d pose = graph.poses.at(id);
+    std::size_t latest = 0;
+    for (const std::size_t i : edges_of[done]) {
       const dendro::PoseGraphEdge& edge = graph.edges[i];
       factors.push_back(all[i]);
       const std::int64_t other = edge.from == id ? edge.to : edge.from;
-      if (other <= latest) continue;
-      latest = other;
+      if (factors.size() > 1 && place[other] <= latest) continue;
+      latest = place[other];
       const auto& T_other = solver->Estimate<Eigen::Isometry3d>(PoseGraphKey(other));
       pose = T_other * (edge.from == id ? edge.T_from_to.inverse() : edge.T_from_to);
     }
@@ -111,7 +115,8 @@ Summary SolveIncrementally(const PoseGraph& graph, bool progress, dendro::Increm
     const UpdateResult result = solver->Update(factors, values);
     summary.update_s.push_back(dendro::measure::ThreadCpuSeconds() - cpu);
     Count(result, &summary);
-    if (progress && ++done % 50 == 0) {
+    ++done;
+    if (progress && done % 50 == 0) {
       fmt::print(stderr, "\r{} of {} poses, 1/2 chi2 {:.3f} ", done, graph.poses.size(), result.error_after);
     }
   }

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include <Eigen/Cholesky>
 #include <gmock/gmock.h>
 
 #include "dendro_slam/factor_graph/g2o.h"
@@ -53,6 +54,33 @@ TEST_P(PublicGraph, BatchFromChordalReachesTheBestKnown) {
   const UpdateResult result = solver.OptimizeBatch(all, values);
   EXPECT_TRUE(result.converged);
   EXPECT_NEAR(result.error_after, GetParam().half_chi2, 1e-5 * GetParam().half_chi2);
+
+  // Marginals against the inverse of the dense Hessian, where that is quick.
+  constexpr std::size_t kMostPoses = 200;
+  if (graph_.poses.size() > kMostPoses) return;
+  const Values estimates = solver.Estimates();
+  std::map<Key, int> offset;
+  for (const auto& entry : estimates) offset.emplace(entry.first, 6 * static_cast<int>(offset.size()));
+  const int size = 6 * static_cast<int>(offset.size());
+  Eigen::MatrixXd H = Eigen::MatrixXd::Zero(size, size);
+  for (const FactorPtr& factor : all) {
+    Eigen::MatrixXd J;
+    Eigen::VectorXd r;
+    factor->Linearize(estimates, &J, &r);
+    for (int a = 0; a < factor->keys().size(); ++a) {
+      for (int b = 0; b < factor->keys().size(); ++b) {
+        H.block<6, 6>(offset.at(factor->keys()[a]), offset.at(factor->keys()[b])) +=
+            J.middleCols<6>(6 * a).transpose() * J.middleCols<6>(6 * b);
+      }
+    }
+  }
+  const Eigen::LLT<Eigen::MatrixXd> llt(H);
+  ASSERT_EQ(llt.info(), Eigen::Success);
+  const Eigen::MatrixXd covariance = llt.solve(Eigen::MatrixXd::Identity(size, size));
+  for (const auto& [key, at] : offset) {
+    const Matrix6d expected = covariance.block<6, 6>(at, at);
+    EXPECT_LT((solver.MarginalCovariance(key) - expected).norm(), 1e-5 * expected.norm()) << KeyName(key);
+  }
 }
 
 // Pose by pose with the settings of solve_g2o: no update raises the error, the last estimate is near

@@ -387,6 +387,15 @@ TEST(Solver, FaultyGraphsAreNamedAndRefused) {
   ExpectRefused<NonFiniteError>(&solver, X(50), "NaN", [&] {
     solver.Update({between(X(0), X(50))}, bad);
   });
+  // Fits, but so far away that its derivative overflows.
+  Eigen::Isometry3d far = solver.Estimate<Eigen::Isometry3d>(X(9));
+  far.translation().setConstant(1e200);
+  const Eigen::Isometry3d motion = solver.Estimate<Eigen::Isometry3d>(X(9)).inverse() * far;
+  Values away;
+  away.Insert(X(50), far);
+  ExpectRefused<NonFiniteError>(&solver, X(50), "check the measurement", [&] {
+    solver.Update({std::make_shared<BetweenFactor>(X(50), X(9), motion.inverse(), NoiseModel::Unit(6))}, away);
+  });
   Values again;
   again.Insert(X(3), I);
   ExpectRefused<DuplicateVariableError>(&solver, X(3), "already", [&] { solver.Update({}, again); });
@@ -475,6 +484,60 @@ TEST(G2o, ReadsWritesAndNamesTheLine) {
   } catch (const std::runtime_error& e) {
     EXPECT_THAT(e.what(), testing::HasSubstr("line 2"));
   }
+}
+
+// Crafted files: what is wrong is named with the variable and with what to do.
+TEST(G2o, FaultyFilesNameTheVariableAndTheRemedy) {
+  const std::string unit = " 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n";
+  const auto vertex = [](int id, const char* x = "0") {
+    return "VERTEX_SE3:QUAT " + std::to_string(id) + " " + x + " 0 0 0 0 0 1\n";
+  };
+  const auto edge = [&](int a, int b) {
+    return "EDGE_SE3:QUAT " + std::to_string(a) + " " + std::to_string(b) + " 1 0 0 0 0 0 1" + unit;
+  };
+  const std::string two = vertex(0) + vertex(1);
+  const struct {
+    std::string text, variable, remedy;
+  } cases[] = {
+      {vertex(0) + vertex(1, "nan") + edge(0, 1), "line 2: vertex 1", "correct the line"},
+      {two + "EDGE_SE3:QUAT 0 1 1 0 inf 0 0 0 1" + unit, "line 3: edge 0 1", "correct the line"},
+      {two + "EDGE_SE3:QUAT 0 1 1 0 0\n", "line 3: edge 0 1", "correct the line"},
+      {two + "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 0" + unit, "line 3: edge 0 1", "0 0 0 1"},
+      {two + "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 0 0 0 0 1 0 0 1 0 1\n", "line 3: edge 0 1",
+       "small information"},
+      {two + edge(0, 1) + edge(1, 7), "line 4: edge 1 7: vertex 7", "add one or take the edge out"},
+      {two + vertex(1) + edge(0, 1), "line 3: vertex 1", "take one of them out"},
+      {two + edge(1, 1), "line 3: edge 1 1", "take it out"},
+      {two + "EDGE_SE3:QUAT 0 -1 1 0 0 0 0 0 1" + unit, "line 3", "number the vertices from 0"},
+      {two + "VERTEX_SE2 2 0 0 0\n", "line 3: tag VERTEX_SE2", "only SE(3)"},
+      {"# nothing\n", "no SE(3) vertex", "it needs"},
+      {two + vertex(2) + vertex(3) + edge(0, 1) + edge(2, 3), "variable x2", "add an edge"},
+      {two + vertex(2) + edge(0, 1), "variable x2", "add an edge"},
+  };
+  for (const auto& c : cases) {
+    try {
+      std::istringstream in(c.text);
+      const PoseGraph graph = ReadG2o(in);
+      ChordalInitialization(graph);
+      ADD_FAILURE() << c.text;
+    } catch (const std::runtime_error& e) {
+      EXPECT_THAT(e.what(), testing::AllOf(testing::HasSubstr(c.variable), testing::HasSubstr(c.remedy)));
+    }
+  }
+}
+
+// A pose that only a later one is joined to waits for it; otherwise the order is that of the ids.
+TEST(G2o, InsertionOrderFollowsIdsAndEdges) {
+  PoseGraph graph;
+  for (const auto& [a, b] : std::vector<std::pair<int, int>>{{0, 1}, {2, 4}, {1, 3}, {3, 4}, {0, 4}}) {
+    PoseGraphEdge edge;
+    edge.from = a;
+    edge.to = b;
+    graph.edges.push_back(edge);
+    graph.poses.emplace(a, Eigen::Isometry3d::Identity());
+    graph.poses.emplace(b, Eigen::Isometry3d::Identity());
+  }
+  EXPECT_THAT(InsertionOrder(graph), testing::ElementsAre(0, 1, 3, 4, 2));
 }
 
 }  // namespace

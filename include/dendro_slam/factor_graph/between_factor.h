@@ -5,10 +5,10 @@
 
 namespace dendro {
 
-/// `Log(T_to_from_measured * T_from^-1 * T_to)`, shape (6), rotation first, and its Jacobians for the
+/// `Log(T_from_to_measured^-1 * T_from^-1 * T_to)`, shape (6), rotation first, and its Jacobians for the
 /// right tangents of the poses.
 /// @param J_from, J_to  Out, shape (6, 6), both or neither null.
-Vector6d BetweenResidual(const Eigen::Isometry3d& T_to_from_measured,
+Vector6d BetweenResidual(const Eigen::Isometry3d& T_from_to_measured,
                          const Eigen::Isometry3d& T_from,
                          const Eigen::Isometry3d& T_to,
                          Matrix6d* J_from,
@@ -30,7 +30,6 @@ class BetweenFactor final : public TypedFactor<Eigen::Isometry3d, Eigen::Isometr
   const char* Kind() const override { return "between"; }
 
   Eigen::Isometry3d T_from_to_;
-  Eigen::Isometry3d T_to_from_;
 };
 
 }  // namespace dendro

@@ -8,6 +8,7 @@
 #include <Eigen/Core>
 #include <Eigen/Geometry>
 
+#include "dendro_slam/factor_graph/errors.h"
 #include "dendro_slam/factor_graph/factor.h"
 #include "dendro_slam/geometry/se3.h"
 
@@ -29,11 +30,17 @@ struct PoseGraph {
   std::vector<PoseGraphEdge> edges;
 };
 
-/// Reads a graph. Vertices that only edges name start at the identity; FIX is read over.
-/// @throws std::runtime_error naming the line for a tag that is no SE(3) vertex or edge, a missing
-///         or non-finite number, a zero quaternion, or an information matrix that is not positive
-///         definite.
+/// Reads a graph. In a file of edges alone all vertices start at the identity; FIX is read over.
+/// @throws std::runtime_error naming the line, the vertex or edge and what to do, for a tag that is no
+///         SE(3) vertex or edge, a missing or non-finite number, a zero quaternion, or an information
+///         matrix that is not positive definite; UnknownVariableError for an edge to a vertex that is
+///         missing among those given.
 PoseGraph ReadG2o(std::istream& in);
+
+/// The order in which poses can be added one by one, every one but the first with an edge to one before
+/// it: ascending ids, a pose that no edge joins to a lower one as soon as it can be.
+/// @throws UnderconstrainedError naming a pose that is not connected to the first.
+std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph);
 
 /// Writes a graph with all digits.
 void WriteG2o(const PoseGraph& graph, std::ostream& out);
@@ -48,7 +55,7 @@ FactorList PoseGraphFactors(const PoseGraph& graph);
 /// linear relaxation `R_j = R_i R_ij`, projected onto SO(3), then translations by linear least
 /// squares. The first pose keeps its value. It does not end in the local minima that an odometry
 /// chain on a sphere or torus leads to.
-/// @throws std::runtime_error if the graph is not connected.
+/// @throws UnderconstrainedError naming a pose that is not connected to the first.
 std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph& graph);
 
 }  // namespace dendro

@@ -37,6 +37,8 @@ int TangentDimension(const Value& value);
 
 /// The value moved by a tangent vector of TangentDimension(value) entries.
 Value Retract(const Value& value, const double* delta);
+/// The same into a value that is there already; no allocation where both have one type.
+void Retract(const Value& value, const double* delta, Value* out);
 
 /// Tangent vector from `from` to `to`, the inverse of Retract; both of one type.
 void LocalCoordinates(const Value& from, const Value& to, double* delta);

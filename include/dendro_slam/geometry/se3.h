@@ -20,6 +20,8 @@ Eigen::Isometry3d ExpSe3(const Vector6d& xi);
 /// Logarithm of SE(3), the inverse of ExpSe3 for rotations below pi.
 /// @return  Twist [omega (rad); rho (m)], shape (6).
 Vector6d LogSe3(const Eigen::Isometry3d& T);
+/// The same for the motion with rotation R and translation t [m].
+Vector6d LogSe3(const Eigen::Matrix3d& R, const Eigen::Vector3d& t);
 
 /// Adjoint matrix: `T Exp(xi) T^-1 = Exp(Adjoint(T) xi)`, rotation first.
 Matrix6d AdjointSe3(const Eigen::Isometry3d& T);
