@@ -104,8 +104,8 @@ void MapperConfig::Validate() const {
   Require(key_frame_angle_deg > 0.0, "key_frame_angle_deg must be > 0");
   Require(key_frame_time_s > 0.0, "key_frame_time_s must be > 0");
   Require(first_key_frames >= 1, "first_key_frames must be >= 1");
-  Require(key_frame_cell_m > 0.0, "key_frame_cell_m must be > 0");
-  Require(key_frames_per_cell >= 0, "key_frames_per_cell must be >= 0");
+  Require(key_frame_reach_m > 0.0, "key_frame_reach_m must be > 0");
+  Require(key_frames_in_reach >= 0, "key_frames_in_reach must be >= 0");
   Require(key_frame_window >= 1, "key_frame_window must be >= 1");
   Require(vio_scale_sigma >= 0.0, "vio_scale_sigma must be >= 0");
   Require(vio_drift_m_per_m >= 0.0, "vio_drift_m_per_m must be >= 0");
@@ -207,7 +207,8 @@ class Mapper::Impl {
   // Key frames of long ago.
   using Cell = std::array<int, 3>;
   Cell CellOf(const Eigen::Vector3d& position) const;
-  std::map<Cell, int> kept_in_cell;
+  int CountKeptAround(const Eigen::Vector3d& position) const;
+  std::map<Cell, std::vector<Eigen::Vector3d>> kept_in_cell;  // Where those stand that stay for good.
   std::vector<std::int64_t> key_frame_scans;    // scan number of each key frame
   std::vector<std::size_t> key_frame_entries;   // first entry of `trajectory` of each key frame
   int last_kept = 0;                            // before `next_judged`
@@ -254,6 +255,7 @@ class Mapper::Impl {
                              const Landmark& landmark,
                              const Eigen::Isometry3d& T_frame_lidar) const;
   bool InsideALandmark(const FittedCylinder& fit, const Eigen::Isometry3d& T_kf_lidar) const;
+  bool OnALandmarkOutOfReach(const FittedCylinder& fit, const Eigen::Isometry3d& T_kf_lidar) const;
   void AddKeyFrame(const MapperInput& input,
                    const std::vector<FittedCylinder>& cylinders,
                    const Hypothesis& h,
@@ -455,6 +457,29 @@ bool Mapper::Impl::InsideALandmark(const FittedCylinder& fit,
   return false;
 }
 
+// True when a fit lies on a landmark of the map that was not looked for, because it is too far away or others
+// are nearer: it is begun no second time. (Twins of landmarks push landmarks out of `nearby`, which then get
+// twins.)
+bool Mapper::Impl::OnALandmarkOutOfReach(const FittedCylinder& fit,
+                                         const Eigen::Isometry3d& T_kf_lidar) const {
+  constexpr double kMaxAngleDeg = 20.0;
+  constexpr double kThickestM = 1.0;
+  const Eigen::Isometry3d T_map_lidar = T_map_kf * T_kf_lidar;
+  const Eigen::Vector3d middle = T_map_lidar * fit.cylinder.point;
+  const Eigen::Vector3d axis = T_map_lidar.linear() * fit.cylinder.axis;
+  const double half = std::max(std::abs(fit.start_s_m), std::abs(fit.end_s_m));
+  for (const LandmarkState& state : map.states()) {
+    if (!state.confirmed || computed_at.count(state.id) > 0) continue;
+    if (std::abs(axis.dot(state.line.axis)) < std::cos(kMaxAngleDeg * kRadPerDeg)) continue;
+    const double reach = half + config.tree_map.max_length_m + kThickestM;
+    if ((middle - state.line.point).squaredNorm() > reach * reach) continue;
+    const LineResidual r = ComputeLineResidual(
+        fit, map.Summary(state.id), T_map_lidar, Matrix6d::Zero(), config.association);
+    if (r.overlap_m > 0.0 && r.offset_m < 2.0 * std::max(r.landmark_radius_m, r.radius_m)) return true;
+  }
+  return false;
+}
+
 // Gravity as VIO sees it, and the ground.
 void Mapper::Impl::AddLevelFactors(const MapperInput& input,
                                    int key_frame,
@@ -573,6 +598,7 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     const bool is_new = id < 0;
     if (is_new) {
       if (InsideALandmark(cylinders[i], h.T_kf_lidar)) continue;
+      if (OnALandmarkOutOfReach(cylinders[i], h.T_kf_lidar)) continue;
       id = map.Add(cylinders[i], T_map_lidar, scan_number);
       started.push_back(id);
       values.Insert(LandmarkKey(id), Value(map.State(id).line));
@@ -659,9 +685,26 @@ Mapper::Impl::Cell Mapper::Impl::CellOf(const Eigen::Vector3d& position) const {
   Cell cell;
   for (int i = 0; i < 3; ++i) {
     cell[static_cast<std::size_t>(i)] =
-        static_cast<int>(std::floor(position[i] / config.key_frame_cell_m));
+        static_cast<int>(std::floor(position[i] / config.key_frame_reach_m));
   }
   return cell;
+}
+
+int Mapper::Impl::CountKeptAround(const Eigen::Vector3d& position) const {
+  const Cell middle = CellOf(position);
+  int count = 0;
+  for (int x = -1; x <= 1; ++x) {
+    for (int y = -1; y <= 1; ++y) {
+      for (int z = -1; z <= 1; ++z) {
+        const auto it = kept_in_cell.find({middle[0] + x, middle[1] + y, middle[2] + z});
+        if (it == kept_in_cell.end()) continue;
+        for (const Eigen::Vector3d& kept : it->second) {
+          if ((kept - position).norm() <= config.key_frame_reach_m) ++count;
+        }
+      }
+    }
+  }
+  return count;
 }
 
 // What the between-factors say together, without those that the estimate contradicts.
@@ -703,7 +746,7 @@ std::optional<UncertainMotion> Mapper::Impl::MotionBetween(const std::vector<Fac
 int Mapper::Impl::FindRedundantKeyFrame() {
   constexpr int kMinOthers = 4;  // Observations that a landmark must keep.
   constexpr int kLater = 5;      // Key frames.
-  if (config.key_frames_per_cell == 0) return -1;
+  if (config.key_frames_in_reach == 0) return -1;
   for (; next_judged < num_key_frames - config.key_frame_window; ++next_judged) {
     // Candidates that only it saw must have had their time, and be out of the graph.
     const int later = std::min(next_judged + kLater, num_key_frames - 1);
@@ -712,8 +755,8 @@ int Mapper::Impl::FindRedundantKeyFrame() {
       return -1;
     }
     const Key key = PoseKey(next_judged);
-    int& kept = kept_in_cell[CellOf(solver.Estimate<Eigen::Isometry3d>(key).translation())];
-    bool redundant = kept >= config.key_frames_per_cell;
+    const Eigen::Vector3d position = solver.Estimate<Eigen::Isometry3d>(key).translation();
+    bool redundant = CountKeptAround(position) >= config.key_frames_in_reach;
     if (redundant) {
       const std::vector<FactorId> factors = solver.FactorsOf(key);
       for (FactorId id : factors) {
@@ -724,7 +767,7 @@ int Mapper::Impl::FindRedundantKeyFrame() {
                   MotionBetween(factors, key, PoseKey(next_judged + 1));
     }
     if (redundant) return next_judged;
-    ++kept;
+    kept_in_cell[CellOf(position)].push_back(position);
     last_kept = next_judged;
   }
   return -1;

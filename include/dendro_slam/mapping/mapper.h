@@ -23,8 +23,8 @@ struct MapperConfig {
 
   // An hour of walking the same rows must not make the graph grow: where many key frames stand already,
   // a later one is taken out again once it is old.
-  double key_frame_cell_m = 1.0;        ///< Side of the cubes in which key frames are counted [m]. > 0.
-  int key_frames_per_cell = 6;          ///< Old key frames kept in a cube; 0: all of them. >= 0.
+  double key_frame_reach_m = 1.0;       ///< Distance within which key frames are counted [m]. > 0.
+  int key_frames_in_reach = 6;          ///< Old key frames kept so close to each other; 0: all of them. >= 0.
   int key_frame_window = 100;           ///< The newest ones are always kept. >= 1.
 
   // Odometry. The messages' own covariances do not tell the drift. What of it changes slowly is a
@@ -70,8 +70,8 @@ struct MapperConfig {
                                         ///< the surface seen returned from it: several twigs, no branch. In [0, 1).
   double column_step_deg = 0.2;         ///< Of the lidar, for that: between two beams of one ring [deg]. > 0.
   double nearby_radius_m = 30.0;        ///< Landmarks farther away are not looked for [m]. > 0.
-  int nearby_max = 150;                 ///< Nor more than so many of the nearest in the map, and so many of
-                                        ///< the nearest candidates. >= 1.
+  int nearby_max = 400;                 ///< Nor more than so many of the nearest in the map, and so many of
+                                        ///< the nearest candidates: a bound on the time of a scan. >= 1.
   int nearby_exact = 48;                ///< Covariances computed anew at a key frame; those of the others grow
                                         ///< by what is not known of the way between, and come next. >= 1.
   double min_radius_m = 0.003;          ///< Thinner fits are not mapped [m]. > 0.
@@ -99,8 +99,8 @@ struct MapperConfig {
     v("key_frame_angle_deg", key_frame_angle_deg);
     v("key_frame_time_s", key_frame_time_s);
     v("first_key_frames", first_key_frames);
-    v("key_frame_cell_m", key_frame_cell_m);
-    v("key_frames_per_cell", key_frames_per_cell);
+    v("key_frame_reach_m", key_frame_reach_m);
+    v("key_frames_in_reach", key_frames_in_reach);
     v("key_frame_window", key_frame_window);
     v("vio_scale_sigma", vio_scale_sigma);
     v("vio_drift_m_per_m", vio_drift_m_per_m);
