@@ -70,8 +70,8 @@ Matrix6d SwapBlocks(const Matrix6d& m) {
 void WritePose(const Eigen::Isometry3d& T, std::ostream& out) {
   Eigen::Quaterniond q(T.linear());
   q.normalize();
-  out << ' ' << T.translation().x() << ' ' << T.translation().y() << ' ' << T.translation().z() << ' '
-      << q.x() << ' ' << q.y() << ' ' << q.z() << ' ' << q.w();
+  out << ' ' << T.translation().x() << ' ' << T.translation().y() << ' ' << T.translation().z()
+      << ' ' << q.x() << ' ' << q.y() << ' ' << q.z() << ' ' << q.w();
 }
 
 Eigen::Matrix3d NearestRotation(const Eigen::Matrix3d& M) {
@@ -111,13 +111,15 @@ PoseGraph ReadG2o(std::istream& in) {
       }
       edge.information = SwapBlocks(information);
       if (Eigen::LLT<Matrix6d>(edge.information).info() != Eigen::Success) {
-        line.Fail("the information matrix is not positive definite; give a direction that was not "
-                  "measured a small information, not none");
+        line.Fail(
+            "the information matrix is not positive definite; give a direction that was not "
+            "measured a small information, not none");
       }
       graph.edges.push_back(edge);
       edge_lines.push_back(number);
     } else {
-      line.Fail("tag " + tag + " is not VERTEX_SE3:QUAT or EDGE_SE3:QUAT; only SE(3) pose graphs are read");
+      line.Fail("tag " + tag +
+                " is not VERTEX_SE3:QUAT or EDGE_SE3:QUAT; only SE(3) pose graphs are read");
     }
   }
   const bool has_vertices = !graph.poses.empty();
@@ -125,15 +127,16 @@ PoseGraph ReadG2o(std::istream& in) {
     const PoseGraphEdge& edge = graph.edges[i];
     for (const std::int64_t id : {edge.from, edge.to}) {
       if (!graph.poses.emplace(id, Eigen::Isometry3d::Identity()).second || !has_vertices) continue;
-      throw UnknownVariableError(
-          PoseGraphKey(id),
-          "line " + std::to_string(edge_lines[i]) + ": edge " + std::to_string(edge.from) + " " +
-              std::to_string(edge.to) + ": vertex " + std::to_string(id) +
-              " has no VERTEX_SE3:QUAT line; add one or take the edge out");
+      throw UnknownVariableError(PoseGraphKey(id),
+                                 "line " + std::to_string(edge_lines[i]) + ": edge " +
+                                     std::to_string(edge.from) + " " + std::to_string(edge.to) +
+                                     ": vertex " + std::to_string(id) +
+                                     " has no VERTEX_SE3:QUAT line; add one or take the edge out");
     }
   }
   if (graph.poses.empty()) {
-    throw std::runtime_error("the file holds no SE(3) vertex; it needs VERTEX_SE3:QUAT or EDGE_SE3:QUAT lines");
+    throw std::runtime_error(
+        "the file holds no SE(3) vertex; it needs VERTEX_SE3:QUAT or EDGE_SE3:QUAT lines");
   }
   return graph;
 }
@@ -159,10 +162,13 @@ std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph) {
     if (reached.count(entry.first) != 0) continue;
     const Key key = PoseGraphKey(entry.first);
     throw UnderconstrainedError(
-        key, "variable " + KeyName(key) + " is under-constrained: no path of edges leads from it to the first pose, " +
-                 KeyName(PoseGraphKey(order.front())) + " (" + std::to_string(order.size()) + " of " +
-                 std::to_string(graph.poses.size()) +
-                 " poses are joined to that); add an edge between the two parts, or solve them as two graphs");
+        key,
+        "variable " + KeyName(key) +
+            " is under-constrained: no path of edges leads from it to the first pose, " +
+            KeyName(PoseGraphKey(order.front())) + " (" + std::to_string(order.size()) + " of " +
+            std::to_string(graph.poses.size()) +
+            " poses are joined to that); add an edge between the two parts, or solve them as two "
+            "graphs");
   }
   return order;
 }
@@ -202,7 +208,8 @@ FactorList PoseGraphFactors(const PoseGraph& graph) {
 std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph& graph) {
   InsertionOrder(graph);  // Throws unless all hang together.
   std::map<std::int64_t, int> index;
-  for (const auto& entry : graph.poses) index.emplace(entry.first, static_cast<int>(index.size()) - 1);
+  for (const auto& entry : graph.poses)
+    index.emplace(entry.first, static_cast<int>(index.size()) - 1);
   const int n = static_cast<int>(index.size()) - 1;  // The first pose is known and has index -1.
   std::map<std::int64_t, Eigen::Isometry3d> out;
   const Eigen::Isometry3d& first = graph.poses.begin()->second;
@@ -218,8 +225,9 @@ std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph&
     H.setFromTriplets(triplets.begin(), triplets.end());
     solver.compute(H);
     if (solver.info() != Eigen::Success || !(solver.vectorD().minCoeff() > 0.0)) {
-      throw std::runtime_error("the linear system of the initialisation has no unique solution although the graph "
-                               "is connected; the information matrices of the edges differ too much in size");
+      throw std::runtime_error(
+          "the linear system of the initialisation has no unique solution although the graph "
+          "is connected; the information matrices of the edges differ too much in size");
     }
     return Eigen::MatrixXd(solver.solve(rhs));
   };

@@ -39,7 +39,8 @@ void SolverConfig::Validate() const {
   Require(std::isfinite(lambda_up) && lambda_up > 1.0, "lambda_up", "> 1");
   Require(positive(lambda_down) && lambda_down < 1.0, "lambda_down", "in (0, 1)");
   Require(positive(lambda_min), "lambda_min", "> 0");
-  Require(std::isfinite(lambda_max) && lambda_max > lambda_initial, "lambda_max", "> lambda_initial");
+  Require(
+      std::isfinite(lambda_max) && lambda_max > lambda_initial, "lambda_max", "> lambda_initial");
   Require(batch_max_iterations >= 1, "batch_max_iterations", ">= 1");
   Require(not_negative(relative_tolerance), "relative_tolerance", ">= 0");
   Require(reorder_interval >= 1, "reorder_interval", ">= 1");
@@ -52,9 +53,10 @@ void SolverConfig::Validate() const {
 int IncrementalSolver::Impl::SlotOf(Key key) const {
   const auto it = slots_.find(key);
   if (it == slots_.end()) {
-    throw UnknownVariableError(key, "variable " + KeyName(key) +
-                                        " is not in the graph; add it with an update before it is "
-                                        "used, or correct the key");
+    throw UnknownVariableError(key,
+                               "variable " + KeyName(key) +
+                                   " is not in the graph; add it with an update before it is "
+                                   "used, or correct the key");
   }
   return it->second;
 }
@@ -81,14 +83,16 @@ void IncrementalSolver::Impl::CheckInput(const FactorList& new_factors,
                                          const UpdateOptions& options) const {
   for (const auto& [key, value] : new_values) {
     if (Contains(key)) {
-      throw DuplicateVariableError(key, "variable " + KeyName(key) +
-                                            " is already in the graph; give new values only for new "
-                                            "variables");
+      throw DuplicateVariableError(key,
+                                   "variable " + KeyName(key) +
+                                       " is already in the graph; give new values only for new "
+                                       "variables");
     }
     if (!IsValid(value)) {
-      throw NonFiniteError(key, "the initial value of variable " + KeyName(key) +
-                                    " is not a valid " + TypeName(value) +
-                                    " (NaN, infinite or off its manifold); correct it before adding it");
+      throw NonFiniteError(key,
+                           "the initial value of variable " + KeyName(key) + " is not a valid " +
+                               TypeName(value) +
+                               " (NaN, infinite or off its manifold); correct it before adding it");
     }
   }
   std::unordered_map<Key, int> uses;
@@ -101,8 +105,9 @@ void IncrementalSolver::Impl::CheckInput(const FactorList& new_factors,
       const Key key = keys[i];
       for (int j = 0; j < i; ++j) {
         if (keys[j] == key) {
-          throw DuplicateVariableError(key, factor->Describe() + ": variable " + KeyName(key) +
-                                                " appears twice in one factor");
+          throw DuplicateVariableError(
+              key,
+              factor->Describe() + ": variable " + KeyName(key) + " appears twice in one factor");
         }
       }
       if (new_values.Contains(key)) {
@@ -111,21 +116,24 @@ void IncrementalSolver::Impl::CheckInput(const FactorList& new_factors,
       } else if (Contains(key)) {
         pointers.push_back(&EstimateValue(key));
       } else {
-        throw UnknownVariableError(key, factor->Describe() + ": variable " + KeyName(key) +
-                                            " has no value; add its initial value with this update");
+        throw UnknownVariableError(key,
+                                   factor->Describe() + ": variable " + KeyName(key) +
+                                       " has no value; add its initial value with this update");
       }
     }
     factor->CheckTypes(pointers.data());
     if (!std::isfinite(factor->Error(pointers.data()))) {
-      throw NonFiniteError(keys[0], factor->Describe() + ": the error at " + KeyName(keys[0]) +
-                                        " is not finite; check the measurement and the initial values");
+      throw NonFiniteError(keys[0],
+                           factor->Describe() + ": the error at " + KeyName(keys[0]) +
+                               " is not finite; check the measurement and the initial values");
     }
   }
   for (const auto& [key, value] : new_values) {
     if (uses.count(key) == 0) {
-      throw UnderconstrainedError(key, "variable " + KeyName(key) +
-                                           " has no factor; add one in the same update or leave the "
-                                           "variable out");
+      throw UnderconstrainedError(key,
+                                  "variable " + KeyName(key) +
+                                      " has no factor; add one in the same update or leave the "
+                                      "variable out");
     }
   }
   std::vector<FactorId> removed = options.remove_factors;
@@ -283,7 +291,8 @@ Eigen::MatrixXd IncrementalSolver::JointMarginalCovariance(const std::vector<Key
 }
 
 std::vector<Eigen::MatrixXd> IncrementalSolver::PairMarginalCovariances(
-    Key first, const std::vector<Key>& others) const {
+    Key first,
+    const std::vector<Key>& others) const {
   return impl_->PairMarginalCovariances(first, others);
 }
 
@@ -302,8 +311,9 @@ int IncrementalSolver::num_factors() const { return impl_->num_factors(); }
 const SolverConfig& IncrementalSolver::config() const { return impl_->config(); }
 
 void IncrementalSolver::ThrowWrongType(Key key) {
-  throw UnknownVariableError(key, "variable " + KeyName(key) +
-                                      " is of another type; ask for it with the type it was added with");
+  throw UnknownVariableError(key,
+                             "variable " + KeyName(key) +
+                                 " is of another type; ask for it with the type it was added with");
 }
 
 }  // namespace dendro

@@ -14,8 +14,8 @@ namespace {
 // Of the prior that makes `to` the origin [rad, m]: far below any measurement.
 constexpr double kOriginSigma = 1e-6;
 
-// Relative decrease of the error below which it is at the optimum: what a further step would move is a
-// thousandth of the sigmas.
+// Relative decrease of the error below which it is at the optimum: what a further step would move
+// is a thousandth of the sigmas.
 constexpr double kTolerance = 1e-6;
 
 }  // namespace
@@ -28,7 +28,8 @@ ScanSummary SummarizeScans(Key from,
   const Eigen::Isometry3d T_to_frame = poses.At<Eigen::Isometry3d>(to).inverse();
   Values start;
   for (const auto& entry : poses) {
-    start.Insert(entry.first, Eigen::Isometry3d(T_to_frame * poses.At<Eigen::Isometry3d>(entry.first)));
+    start.Insert(entry.first,
+                 Eigen::Isometry3d(T_to_frame * poses.At<Eigen::Isometry3d>(entry.first)));
   }
   std::vector<Key> kept = {from};
   for (const FactorPtr& factor : factors) {

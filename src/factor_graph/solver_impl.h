@@ -23,8 +23,8 @@ inline FactorId MakeFactorId(std::uint32_t generation, int slot) {
 /// Errors are summed in blocks, so that a few changed factors do not cost a sum over all.
 constexpr std::size_t kErrorBlock = 64;
 
-/// What a change of 1 m is in a value's last tangent coordinate: a cylinder's curvature counts by the
-/// change of its radius, `|dr| = |dkappa| / kappa^2`.
+/// What a change of 1 m is in a value's last tangent coordinate: a cylinder's curvature counts by
+/// the change of its radius, `|dr| = |dkappa| / kappa^2`.
 inline double LastUnit(const Value& value) {
   const auto* cylinder = std::get_if<Cylinder>(&value);
   return cylinder == nullptr ? 1.0 : cylinder->curvature * cylinder->curvature;
@@ -34,12 +34,14 @@ inline double LastUnit(const Value& value) {
 
 /// The solver behind IncrementalSolver.
 ///
-/// Variables and factors live in slots of a GraphStore; the Bayes tree, the errors and the work space
-/// refer to them by slot. An update applies a Change, eliminates what it touches, and takes steps; a call
-/// that throws reverts its Change.
+/// Variables and factors live in slots of a GraphStore; the Bayes tree, the errors and the work
+/// space refer to them by slot. An update applies a Change, eliminates what it touches, and takes
+/// steps; a call that throws reverts its Change.
 class IncrementalSolver::Impl {
  public:
-  explicit Impl(const SolverConfig& config) : config_(config), tree_(&graph_) { config_.Validate(); }
+  explicit Impl(const SolverConfig& config) : config_(config), tree_(&graph_) {
+    config_.Validate();
+  }
 
   UpdateResult Update(const FactorList& new_factors,
                       const Values& new_values,
@@ -54,7 +56,8 @@ class IncrementalSolver::Impl {
   Values Estimates() const;
   bool Contains(Key key) const { return slots_.count(key) != 0; }
   Eigen::MatrixXd JointMarginalCovariance(const std::vector<Key>& keys) const;
-  std::vector<Eigen::MatrixXd> PairMarginalCovariances(Key first, const std::vector<Key>& others) const;
+  std::vector<Eigen::MatrixXd> PairMarginalCovariances(Key first,
+                                                       const std::vector<Key>& others) const;
   double Error() const { return std::accumulate(error_sums_.begin(), error_sums_.end(), 0.0); }
   double FactorError(FactorId id) const { return errors_[FactorSlot(id)]; }
   const FactorPtr& GetFactor(FactorId id) const { return graph_.factors[FactorSlot(id)].factor; }
@@ -72,25 +75,25 @@ class IncrementalSolver::Impl {
   struct Move {
     int variable;
     double before[kMaxTangentDimension];
-    double after[kMaxTangentDimension];            // Of the whole step.
+    double after[kMaxTangentDimension];  // Of the whole step.
     double published_before[kMaxTangentDimension];
   };
 
   // One step of back-substitution that can be undone.
   struct Step {
     std::vector<Move> moves;
-    std::vector<int> factors;       // With a variable that moved.
-    std::vector<double> errors;     // Theirs, before.
-    std::vector<int> cliques;       // Solved.
+    std::vector<int> factors;    // With a variable that moved.
+    std::vector<double> errors;  // Theirs, before.
+    std::vector<int> cliques;    // Solved.
 
     void Clear();  // Keeps the memory.
   };
 
   // What an update does to the graph, with what is needed to take it back.
   struct Change {
-    std::vector<int> new_variables;      // Slots.
-    std::vector<int> new_factors;        // Slots.
-    std::vector<int> touched;            // Variables of new and removed factors that are in the tree.
+    std::vector<int> new_variables;  // Slots.
+    std::vector<int> new_factors;    // Slots.
+    std::vector<int> touched;        // Variables of new and removed factors that are in the tree.
     std::vector<int> dropped_variables;  // They lost their last factor.
     std::vector<int> removed_slots;
     std::vector<internal::FactorRecord> removed_records;
@@ -122,7 +125,9 @@ class IncrementalSolver::Impl {
   void ComputeWeights();
 
   // Updates (solver_update.cpp).
-  Change ApplyChange(const FactorList& new_factors, const Values& new_values, const UpdateOptions& options);
+  Change ApplyChange(const FactorList& new_factors,
+                     const Values& new_values,
+                     const UpdateOptions& options);
   void Revert(const Change& change);
   std::vector<int> TakeMovedFar();
   void MarkRelinearized(const std::vector<int>& variables);
@@ -146,13 +151,13 @@ class IncrementalSolver::Impl {
 
   SolverConfig config_;
   internal::GraphStore graph_;
-  mutable internal::BayesTree tree_;  // Marginals take damping out of it.
-  std::vector<double> errors_;  // Per factor slot, at the estimate; 0 in free slots.
+  mutable internal::BayesTree tree_;     // Marginals take damping out of it.
+  std::vector<double> errors_;           // Per factor slot, at the estimate; 0 in free slots.
   std::vector<double> error_sums_;       // Per block of kErrorBlock factor slots.
   std::vector<char> error_block_stale_;  // Its sum is to be taken again, by TotalError.
   std::vector<int> stale_error_blocks_;
-  std::vector<int> moved_;               // Moved since they were last looked at for re-linearisation.
-  std::vector<char> has_moved_;          // Per variable slot: is in moved_.
+  std::vector<int> moved_;       // Moved since they were last looked at for re-linearisation.
+  std::vector<char> has_moved_;  // Per variable slot: is in moved_.
   std::unordered_map<Key, int> slots_;
   std::vector<int> free_variables_;
   std::vector<int> free_factors_;

@@ -56,7 +56,8 @@ void IncrementalSolver::Impl::EvaluateErrors(const std::vector<int>& slots) {
     if (i + kAhead < slots.size()) {
       const FactorRecord& next = graph_.factors[slots[i + kAhead]];
       PrefetchLines(next.factor.get(), kFactorBytes);
-      for (const int v : next.variables) PrefetchLines(&graph_.variables[v].estimate, sizeof(Value));
+      for (const int v : next.variables)
+        PrefetchLines(&graph_.variables[v].estimate, sizeof(Value));
     }
     SetError(slots[i], EvaluateError(slots[i]));
   }
@@ -75,7 +76,8 @@ void IncrementalSolver::Impl::Prefetch(const std::vector<int>& queue, std::size_
   }
   if (at + kAhead < queue.size()) {
     const Clique& clique = tree_.clique(queue[at + kAhead]);
-    PrefetchLines(clique.conditional.data(), std::min(clique.conditional.size(), kMaxDoubles) * sizeof(double));
+    PrefetchLines(clique.conditional.data(),
+                  std::min(clique.conditional.size(), kMaxDoubles) * sizeof(double));
     for (int i = 0; i < clique.num_frontal; ++i) {
       PrefetchLines(&graph_.states[clique.variables[i]], sizeof(VariableState));
       PrefetchLines(&graph_.variables[clique.variables[i]], sizeof(VariableRecord));
@@ -172,8 +174,7 @@ bool IncrementalSolver::Impl::NeedsRelinearization(int slot) const {
       return norm(0, 3) > config_.relinearize_rotation_rad ||
              norm(3, 3) > config_.relinearize_translation_m;
     case 1:
-      return norm(0, 2) > config_.relinearize_axis_rad ||
-             norm(2, 2) > config_.relinearize_offset_m;
+      return norm(0, 2) > config_.relinearize_axis_rad || norm(2, 2) > config_.relinearize_offset_m;
     default:
       return norm(0, v.dimension) > config_.relinearize_offset_m;
   }

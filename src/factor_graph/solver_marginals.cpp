@@ -23,7 +23,8 @@ constexpr double kNoInformation = 1e-12;
 }  // namespace
 
 // What variables leave on their neighbours: a linear factor, or none without neighbours.
-// @param removed_factors  In: factors that are to go without leaving anything; out: also all those of
+// @param removed_factors  In: factors that are to go without leaving anything; out: also all those
+// of
 //                         the variables.
 FactorList IncrementalSolver::Impl::Absorb(const std::vector<Key>& keys,
                                            std::vector<FactorId>* removed_factors) {
@@ -99,14 +100,15 @@ FactorList IncrementalSolver::Impl::Absorb(const std::vector<Key>& keys,
     const Eigen::LDLT<Eigen::MatrixXd> ldlt(H.topLeftCorner(eliminated, eliminated));
     const Eigen::VectorXd diagonal = H.diagonal().head(eliminated);
     if (ldlt.info() != Eigen::Success || !(ldlt.vectorD().minCoeff() > 0.0)) {
-      throw UnderconstrainedError(
-          graph_.variables[removed.front()].key,
-          "variable " + KeyName(graph_.variables[removed.front()].key) +
-              " cannot be marginalised: its factors leave a direction of the removed variables free; "
-              "add a prior or keep the variable");
+      throw UnderconstrainedError(graph_.variables[removed.front()].key,
+                                  "variable " + KeyName(graph_.variables[removed.front()].key) +
+                                      " cannot be marginalised: its factors leave a direction of "
+                                      "the removed variables free; "
+                                      "add a prior or keep the variable");
     }
     const Eigen::MatrixXd X = ldlt.solve(H.topRightCorner(eliminated, kept));
-    Eigen::MatrixXd H_kept = H.bottomRightCorner(kept, kept) - H.bottomLeftCorner(kept, eliminated) * X;
+    Eigen::MatrixXd H_kept =
+        H.bottomRightCorner(kept, kept) - H.bottomLeftCorner(kept, eliminated) * X;
     H_kept = (0.5 * (H_kept + H_kept.transpose())).eval();
     Eigen::VectorXd g_kept = g.tail(kept) - X.transpose() * g.head(eliminated);
     // Where the removed variables took all information with them (a pose that only hung on its
@@ -148,9 +150,10 @@ UpdateResult IncrementalSolver::Impl::UpdateMarginalizing(const FactorList& new_
     for (const Key key : factor->keys()) {
       const auto& gone = options.marginalize;
       if (std::find(gone.begin(), gone.end(), key) == gone.end()) continue;
-      throw UnknownVariableError(key, factor->Describe() + ": variable " + KeyName(key) +
-                                          " is to be marginalised by the same update; leave one of "
-                                          "the two out");
+      throw UnknownVariableError(key,
+                                 factor->Describe() + ": variable " + KeyName(key) +
+                                     " is to be marginalised by the same update; leave one of "
+                                     "the two out");
     }
   }
   UpdateOptions rest = options;
@@ -191,7 +194,8 @@ Eigen::MatrixXd IncrementalSolver::Impl::TangentAtEstimate(int slot) const {
   return Eigen::Map<const Eigen::MatrixXd>(buffer, d, d).inverse();
 }
 
-Eigen::MatrixXd IncrementalSolver::Impl::JointMarginalCovariance(const std::vector<Key>& keys) const {
+Eigen::MatrixXd IncrementalSolver::Impl::JointMarginalCovariance(
+    const std::vector<Key>& keys) const {
   std::vector<int> selected;
   for (const Key key : keys) selected.push_back(SlotOf(key));
   TakeOutDamping();
@@ -207,7 +211,8 @@ Eigen::MatrixXd IncrementalSolver::Impl::JointMarginalCovariance(const std::vect
 }
 
 std::vector<Eigen::MatrixXd> IncrementalSolver::Impl::PairMarginalCovariances(
-    Key first, const std::vector<Key>& others) const {
+    Key first,
+    const std::vector<Key>& others) const {
   std::vector<int> selected{SlotOf(first)};
   for (const Key key : others) selected.push_back(SlotOf(key));
   TakeOutDamping();
@@ -219,7 +224,8 @@ std::vector<Eigen::MatrixXd> IncrementalSolver::Impl::PairMarginalCovariances(
   int column = d_first;
   for (std::size_t i = 1; i < selected.size(); ++i) {
     const int d = graph_.states[selected[i]].dimension;
-    const Eigen::MatrixXd other = Y.middleCols(column, d) * TangentAtEstimate(selected[i]).transpose();
+    const Eigen::MatrixXd other =
+        Y.middleCols(column, d) * TangentAtEstimate(selected[i]).transpose();
     Eigen::MatrixXd joint(d_first + d, d_first + d);
     joint.topLeftCorner(d_first, d_first) = own;
     joint.topRightCorner(d_first, d).noalias() = Y.leftCols(d_first).transpose() * other;

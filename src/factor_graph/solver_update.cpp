@@ -47,7 +47,8 @@ void IncrementalSolver::Impl::Step::Clear() {
 }
 
 // Back-substitution from the roots through every clique that was factorised or whose separator has
-// moved by more than the threshold (Kaess et al. 2012, "wildfire"); then the estimates and the errors of what has moved.
+// moved by more than the threshold (Kaess et al. 2012, "wildfire"); then the estimates and the
+// errors of what has moved.
 void IncrementalSolver::Impl::Solve(double publish_threshold, double still_threshold, Step* step) {
   step->Clear();
   ++stamp_;
@@ -68,8 +69,9 @@ void IncrementalSolver::Impl::Solve(double publish_threshold, double still_thres
     }
     queue.insert(queue.end(), clique.children.begin(), clique.children.end());
     Prefetch(queue, next);
-    x_.resize(std::max(x_.size(),
-                       static_cast<std::size_t>(clique.frontal_dimension + clique.separator_dimension)));
+    x_.resize(
+        std::max(x_.size(),
+                 static_cast<std::size_t>(clique.frontal_dimension + clique.separator_dimension)));
     tree_.SolveClique(clique, x_.data());
     const double* x = x_.data();
     for (int i = 0; i < clique.num_frontal; ++i) {
@@ -193,11 +195,14 @@ void IncrementalSolver::Impl::ThrowUnderconstrained(int slot) const {
   const Key key = graph_.variables[slot].key;
   for (const int f : graph_.variables[slot].factors) {
     const FactorRecord& record = graph_.factors[f];
-    if (std::all_of(record.hessian.begin(), record.hessian.end(), [](double x) { return std::isfinite(x); })) {
+    if (std::all_of(record.hessian.begin(), record.hessian.end(), [](double x) {
+          return std::isfinite(x);
+        })) {
       continue;
     }
-    throw NonFiniteError(key, record.factor->Describe() + ": its derivative at " + KeyName(key) +
-                                  " is not finite; check the measurement and the initial values");
+    throw NonFiniteError(key,
+                         record.factor->Describe() + ": its derivative at " + KeyName(key) +
+                             " is not finite; check the measurement and the initial values");
   }
   // The part of the graph that hangs together with the variable.
   std::vector<char> seen(graph_.variables.size(), 0);
@@ -220,9 +225,11 @@ void IncrementalSolver::Impl::ThrowUnderconstrained(int slot) const {
   const std::string name = "variable " + KeyName(key);
   if (!anchored) {
     throw UnderconstrainedError(
-        key, name + " is under-constrained: nothing fixes the part of the graph that holds it (" +
-                 std::to_string(part.size()) + " variables) in space; add a prior on one of its "
-                 "poses, or a factor that joins it to the rest");
+        key,
+        name + " is under-constrained: nothing fixes the part of the graph that holds it (" +
+            std::to_string(part.size()) +
+            " variables) in space; add a prior on one of its "
+            "poses, or a factor that joins it to the rest");
   }
   std::string factors;
   for (const int f : graph_.variables[slot].factors) {
@@ -232,13 +239,14 @@ void IncrementalSolver::Impl::ThrowUnderconstrained(int slot) const {
     }
     factors += (factors.empty() ? "" : ", ") + graph_.factors[f].factor->Describe();
   }
-  throw UnderconstrainedError(key, name + " is under-constrained: its factors (" + factors +
-                                       ") leave a direction of it free; add a prior on " +
-                                       KeyName(key) + " or a factor that sees that direction");
+  throw UnderconstrainedError(key,
+                              name + " is under-constrained: its factors (" + factors +
+                                  ") leave a direction of it free; add a prior on " + KeyName(key) +
+                                  " or a factor that sees that direction");
 }
 
-// What the update does to the variables and factors; nothing is linearised or eliminated yet. Removed
-// factors are kept aside for the case that the new graph cannot be solved.
+// What the update does to the variables and factors; nothing is linearised or eliminated yet.
+// Removed factors are kept aside for the case that the new graph cannot be solved.
 IncrementalSolver::Impl::Change IncrementalSolver::Impl::ApplyChange(const FactorList& new_factors,
                                                                      const Values& new_values,
                                                                      const UpdateOptions& options) {
@@ -251,7 +259,8 @@ IncrementalSolver::Impl::Change IncrementalSolver::Impl::ApplyChange(const Facto
     change.removed_slots.push_back(slot);
     DropFactor(slot);
   }
-  for (const auto& [key, value] : new_values) change.new_variables.push_back(AddVariable(key, value));
+  for (const auto& [key, value] : new_values)
+    change.new_variables.push_back(AddVariable(key, value));
   for (const FactorPtr& factor : new_factors) {
     const int slot = AddFactor(factor);
     change.new_factors.push_back(slot);
@@ -291,8 +300,8 @@ void IncrementalSolver::Impl::Revert(const Change& change) {
   RestoreTree();
 }
 
-// The variables that have moved so far that they are to be linearised anew, ascending; the others are
-// looked at again when they have moved again.
+// The variables that have moved so far that they are to be linearised anew, ascending; the others
+// are looked at again when they have moved again.
 std::vector<int> IncrementalSolver::Impl::TakeMovedFar() {
   std::vector<int> far;
   std::sort(moved_.begin(), moved_.end());
@@ -312,8 +321,8 @@ void IncrementalSolver::Impl::MarkRelinearized(const std::vector<int>& variables
   }
 }
 
-// Linearises what is new or has moved far, and finds the new variables a place in the tree: in a new
-// order around the new factors, in the old one elsewhere.
+// Linearises what is new or has moved far, and finds the new variables a place in the tree: in a
+// new order around the new factors, in the old one elsewhere.
 void IncrementalSolver::Impl::Eliminate(const Change& change,
                                         const UpdateOptions& options,
                                         UpdateResult* result) {
@@ -332,7 +341,8 @@ void IncrementalSolver::Impl::Eliminate(const Change& change,
   }
   if (epoch_ - last_reorder_ >= config_.reorder_interval) {
     for (int c = 0; c < tree_.num_slots(); ++c) {
-      if (tree_.clique(c).alive && tree_.clique(c).created > last_reorder_) tree_.MarkStructuralClique(c);
+      if (tree_.clique(c).alive && tree_.clique(c).created > last_reorder_)
+        tree_.MarkStructuralClique(c);
     }
     last_reorder_ = epoch_;
   }
@@ -351,7 +361,8 @@ void IncrementalSolver::Impl::Eliminate(const Change& change,
   tree_.Restructure(change.new_variables, joining, groups_, epoch_);
 }
 
-// Takes a half, a quarter or an eighth of the step that was just undone, the first that does not raise the error.
+// Takes a half, a quarter or an eighth of the step that was just undone, the first that does not
+// raise the error.
 bool IncrementalSolver::Impl::ShortenUntilLower(double error_before) {
   for (const double fraction : {0.5, 0.25, 0.125}) {
     Shorten(step_, fraction);
@@ -361,8 +372,8 @@ bool IncrementalSolver::Impl::ShortenUntilLower(double error_before) {
   return false;
 }
 
-// Levenberg-Marquardt on the marked part of the tree: a step, and others with damping as long as they
-// raise the error.
+// Levenberg-Marquardt on the marked part of the tree: a step, and others with damping as long as
+// they raise the error.
 void IncrementalSolver::Impl::TakeSteps(UpdateResult* result) {
   std::vector<int> touched;
   bool damped = lambda_ > 0.0;
@@ -406,7 +417,8 @@ void IncrementalSolver::Impl::TakeSteps(UpdateResult* result) {
       for (const Move& move : step.moves) {
         const VariableState& state = graph_.states[move.variable];
         const auto moved = [](double d) { return d != 0.0; };
-        if (std::any_of(state.delta, state.delta + state.dimension, moved)) stale.push_back(move.variable);
+        if (std::any_of(state.delta, state.delta + state.dimension, moved))
+          stale.push_back(move.variable);
       }
       Relinearize(stale);
       MarkRelinearized(stale);
@@ -420,7 +432,8 @@ void IncrementalSolver::Impl::TakeSteps(UpdateResult* result) {
   damping_ = {factorized_with, &weights_};
   for (const int c : tree_.factorized()) {
     const Clique& clique = tree_.clique(c);
-    damped_variables_.insert(damped_variables_.end(), clique.variables.begin(),
+    damped_variables_.insert(damped_variables_.end(),
+                             clique.variables.begin(),
                              clique.variables.begin() + clique.num_frontal);
   }
 }
@@ -441,7 +454,8 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
     Revert(change);
     throw;
   }
-  free_factors_.insert(free_factors_.end(), change.removed_slots.begin(), change.removed_slots.end());
+  free_factors_.insert(
+      free_factors_.end(), change.removed_slots.begin(), change.removed_slots.end());
   free_variables_.insert(
       free_variables_.end(), change.dropped_variables.begin(), change.dropped_variables.end());
   for (const int f : change.new_factors) {
@@ -451,13 +465,14 @@ UpdateResult IncrementalSolver::Impl::Update(const FactorList& new_factors,
     result = Iterate(config_.relative_tolerance, config_.batch_max_iterations, std::move(result));
   }
   result.error_after = TotalError();
-  result.seconds =
-      std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return result;
 }
 
 // Levenberg-Marquardt on the whole graph in the present elimination order.
-UpdateResult IncrementalSolver::Impl::Iterate(double tolerance, int max_iterations, UpdateResult result) {
+UpdateResult IncrementalSolver::Impl::Iterate(double tolerance,
+                                              int max_iterations,
+                                              UpdateResult result) {
   std::vector<int> all;
   for (std::size_t v = 0; v < graph_.variables.size(); ++v) {
     if (graph_.variables[v].alive) all.push_back(static_cast<int>(v));
@@ -526,8 +541,7 @@ UpdateResult IncrementalSolver::Impl::OptimizeBatch(const FactorList& new_factor
     throw;
   }
   result.error_after = TotalError();
-  result.seconds =
-      std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return result;
 }
 

@@ -1,6 +1,6 @@
-// The graph that the mapping builds, with all its kinds of factors and robust kernels, key frames taken
-// out and landmarks merged: after convergence the incremental estimate and its marginals are those of
-// batch solutions and of the dense Hessian of the factors that are left.
+// The graph that the mapping builds, with all its kinds of factors and robust kernels, key frames
+// taken out and landmarks merged: after convergence the incremental estimate and its marginals are
+// those of batch solutions and of the dense Hessian of the factors that are left.
 #include <cmath>
 #include <map>
 #include <memory>
@@ -8,8 +8,8 @@
 #include <set>
 #include <vector>
 
-#include <Eigen/LU>
 #include <gmock/gmock.h>
+#include <Eigen/LU>
 
 #include "dendro_slam/factor_graph/between_factor.h"
 #include "dendro_slam/factor_graph/cylinder_factor.h"
@@ -33,7 +33,7 @@ const Key kGround = MakeKey('g', 0);
 
 constexpr int kKeyFrames = 80;
 constexpr int kTrees = 8;
-constexpr int kDriftEvery = 12;   // Key frames with one variable of the drift.
+constexpr int kDriftEvery = 12;  // Key frames with one variable of the drift.
 constexpr double kFalsePart = 0.05;
 
 // The weights of robust kernels follow the residuals, so marginals are as exact as the convergence.
@@ -47,7 +47,8 @@ NoiseModel Huber(const Vector6d& sigma) {
   return NoiseModel::Sigmas(sigma).WithKernel(RobustKernel::Huber(3.0));
 }
 
-// What a key frame brings: VIO with a drift, ICP, gravity, ground, and the cylinders in view, some false.
+// What a key frame brings: VIO with a drift, ICP, gravity, ground, and the cylinders in view, some
+// false.
 class MappingGraph : public testing::TestWithParam<int> {
  protected:
   MappingGraph() : rng_(static_cast<unsigned>(GetParam())) {
@@ -87,7 +88,8 @@ class MappingGraph : public testing::TestWithParam<int> {
       factors.push_back(std::make_shared<PosePrior>(X(0), T, NoiseModel::Isotropic(6, 1e-3)));
       const PointN flat = PointN::Zero(3);
       values.Insert(kGround, flat);
-      factors.push_back(std::make_shared<VectorPrior>(kGround, flat, NoiseModel::Isotropic(3, 1.0)));
+      factors.push_back(
+          std::make_shared<VectorPrior>(kGround, flat, NoiseModel::Isotropic(3, 1.0)));
     } else {
       const Isometry3d motion = TruePose(k - 1).inverse() * T;
       const int d = (k - 1) / kDriftEvery;
@@ -95,7 +97,8 @@ class MappingGraph : public testing::TestWithParam<int> {
         const PointN zero = PointN::Zero(kDriftDimension);
         values.Insert(D(d), zero);
         if (d == 0) {
-          factors.push_back(std::make_shared<VectorPrior>(D(0), zero, NoiseModel::Isotropic(4, 0.05)));
+          factors.push_back(
+              std::make_shared<VectorPrior>(D(0), zero, NoiseModel::Isotropic(4, 0.05)));
         } else {
           factors.push_back(std::make_shared<DriftChangeFactor>(
               D(d - 1), D(d), Eigen::Vector4d(1.0, 0.8, 0.8, 0.8), NoiseModel::Isotropic(4, 0.01)));
@@ -114,12 +117,16 @@ class MappingGraph : public testing::TestWithParam<int> {
       guess = solver_.Estimate<Isometry3d>(X(k - 1)) * vio;
     }
     values.Insert(X(k), guess);
-    const Vector3d up = (T.linear().transpose() * Vector3d::UnitZ() + RandomVector<3>(rng_, 0.005)).normalized();
+    const Vector3d up =
+        (T.linear().transpose() * Vector3d::UnitZ() + RandomVector<3>(rng_, 0.005)).normalized();
     factors.push_back(std::make_shared<GravityFactor>(
         X(k), up, NoiseModel::Isotropic(2, 0.005).WithKernel(RobustKernel::Huber(3.0))));
     if (k % 2 == 0) {
       factors.push_back(std::make_shared<GroundFactor>(
-          X(k), kGround, up, T.translation().z() + 0.05 * Normal(rng_),
+          X(k),
+          kGround,
+          up,
+          T.translation().z() + 0.05 * Normal(rng_),
           NoiseModel::Sigmas(Vector3d(0.05, 0.03, 0.03)).WithKernel(RobustKernel::Cauchy(2.0))));
     }
     std::uniform_real_distribution<double> uniform(0.0, 1.0);
@@ -130,9 +137,13 @@ class MappingGraph : public testing::TestWithParam<int> {
           TransformCylinder(T.inverse(), trees_[l])
               .Retract(wrong * Vector5d(cylinder_sigma_.cwiseProduct(RandomVector<5>(rng_))));
       const Key landmark = LandmarkOf(l, k);
-      factors.push_back(std::make_shared<CylinderFactor>(
-          X(k), landmark, measured, Matrix5d(cylinder_sigma_.cwiseAbs2().asDiagonal()), CylinderParts{},
-          RobustKernel::Huber(1.5)));
+      factors.push_back(
+          std::make_shared<CylinderFactor>(X(k),
+                                           landmark,
+                                           measured,
+                                           Matrix5d(cylinder_sigma_.cwiseAbs2().asDiagonal()),
+                                           CylinderParts{},
+                                           RobustKernel::Huber(1.5)));
       if (!solver_.Contains(landmark)) values.Insert(landmark, TransformCylinder(guess, measured));
     }
     const UpdateResult result = solver_.Update(factors, values);
@@ -144,7 +155,9 @@ class MappingGraph : public testing::TestWithParam<int> {
     UpdateOptions options;
     options.remove_factors = solver_.FactorsOf(X(k));
     const Isometry3d motion = TruePose(k - 1).inverse() * TruePose(k + 1);
-    solver_.Update({std::make_shared<BetweenFactor>(X(k - 1), X(k + 1), motion, Huber(icp_sigma_))}, {}, options);
+    solver_.Update({std::make_shared<BetweenFactor>(X(k - 1), X(k + 1), motion, Huber(icp_sigma_))},
+                   {},
+                   options);
     EXPECT_FALSE(solver_.Contains(X(k)));
   }
 
@@ -153,8 +166,12 @@ class MappingGraph : public testing::TestWithParam<int> {
     FactorList moved;
     for (const FactorId id : solver_.FactorsOf(L(100))) {
       const auto& seen = dynamic_cast<const CylinderFactor&>(*solver_.GetFactor(id));
-      moved.push_back(std::make_shared<CylinderFactor>(
-          seen.keys()[0], L(0), seen.measured(), seen.covariance(), seen.parts(), seen.noise().kernel()));
+      moved.push_back(std::make_shared<CylinderFactor>(seen.keys()[0],
+                                                       L(0),
+                                                       seen.measured(),
+                                                       seen.covariance(),
+                                                       seen.parts(),
+                                                       seen.noise().kernel()));
       options.remove_factors.push_back(id);
     }
     solver_.Update(moved, {}, options);
@@ -200,7 +217,8 @@ class MappingGraph : public testing::TestWithParam<int> {
         int cb = 0;
         for (const Key b : factor->keys()) {
           const int db = TangentDimension(estimates.Get(b));
-          H.block(offset.at(a), offset.at(b), da, db) += J.middleCols(ca, da).transpose() * J.middleCols(cb, db);
+          H.block(offset.at(a), offset.at(b), da, db) +=
+              J.middleCols(ca, da).transpose() * J.middleCols(cb, db);
           cb += db;
         }
         ca += da;
@@ -210,7 +228,8 @@ class MappingGraph : public testing::TestWithParam<int> {
     for (const auto& [key, value] : estimates) {
       const int d = TangentDimension(value);
       const Eigen::MatrixXd expected = covariance.block(offset.at(key), offset.at(key), d, d);
-      EXPECT_LT((solver_.MarginalCovariance(key) - expected).norm(), 1e-5 * expected.norm()) << KeyName(key);
+      EXPECT_LT((solver_.MarginalCovariance(key) - expected).norm(), 1e-5 * expected.norm())
+          << KeyName(key);
     }
   }
 
@@ -230,7 +249,8 @@ TEST_P(MappingGraph, IncrementalEqualsBatch) {
     if (k > 50 && k % 10 == 5) RemoveKeyFrame(k - 40);
     if (k % 40 == 39) ExpectBatch();
   }
-  // And it is a map: the landmarks stand where the trees do, in spite of drift and false observations.
+  // And it is a map: the landmarks stand where the trees do, in spite of drift and false
+  // observations.
   for (int l = 0; l < kTrees; ++l) {
     const Vector5d error = trees_[l].LocalCoordinates(solver_.Estimate<Cylinder>(L(l)));
     EXPECT_LT(error.head<2>().norm(), 0.02) << l;

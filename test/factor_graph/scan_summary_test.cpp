@@ -1,12 +1,12 @@
-// Scans between key frames as one factor per landmark, against the dense normal equations of the scans
-// and against the graph that keeps every scan.
+// Scans between key frames as one factor per landmark, against the dense normal equations of the
+// scans and against the graph that keeps every scan.
 #include <map>
 #include <memory>
 #include <random>
 #include <vector>
 
-#include <Eigen/LU>
 #include <gmock/gmock.h>
+#include <Eigen/LU>
 
 #include "dendro_slam/factor_graph/between_factor.h"
 #include "dendro_slam/factor_graph/incremental_solver.h"
@@ -46,8 +46,10 @@ struct Flight {
         Vector6d motion;
         motion << 0.0, 0.0, 0.02, 0.08, 0.01, 0.0;
         T = T * ExpSe3(motion);
-        const Eigen::Isometry3d Z = ExpSe3(motion) * ExpSe3(sigma.cwiseProduct(RandomVector<6>(rng)));
-        factors.push_back(std::make_shared<BetweenFactor>(X(k - 1), X(k), Z, NoiseModel::Sigmas(sigma)));
+        const Eigen::Isometry3d Z =
+            ExpSe3(motion) * ExpSe3(sigma.cwiseProduct(RandomVector<6>(rng)));
+        factors.push_back(
+            std::make_shared<BetweenFactor>(X(k - 1), X(k), Z, NoiseModel::Sigmas(sigma)));
         odometry.push_back(odometry.back() * Z);
       }
       for (int l = 0; l < kCylinders; ++l) {
@@ -116,12 +118,14 @@ TEST(ScanSummary, CarriesTheMarginalsOfTheDenseNormalEquations) {
   }
   const Eigen::MatrixXd covariance = H.inverse();
   // It is the optimum: what is left to move is far below the sigmas.
-  EXPECT_LT((covariance * g).cwiseQuotient(covariance.diagonal().cwiseSqrt()).cwiseAbs().maxCoeff(), 1e-2);
+  EXPECT_LT((covariance * g).cwiseQuotient(covariance.diagonal().cwiseSqrt()).cwiseAbs().maxCoeff(),
+            1e-2);
   for (std::size_t i = 1; i < summary.factors.size(); ++i) {
     const auto& seen = dynamic_cast<const CylinderFactor&>(*summary.factors[i]);
     const int o = offset.at(seen.keys()[1]);
     const Matrix5d expected = covariance.block<5, 5>(o, o);
-    EXPECT_LT((seen.covariance() - expected).norm(), 1e-6 * expected.norm()) << KeyName(seen.keys()[1]);
+    EXPECT_LT((seen.covariance() - expected).norm(), 1e-6 * expected.norm())
+        << KeyName(seen.keys()[1]);
   }
   const auto& motion = dynamic_cast<const BetweenFactor&>(*summary.factors[0]);
   EXPECT_EQ(motion.keys()[0], X(5));
@@ -155,13 +159,15 @@ TEST(ScanSummary, DoesNotDependOnTheFrame) {
 TEST(ScanSummary, KeyFramesKnowWhatAllScansKnow) {
   constexpr int kStride = 5, kCount = 101;
   const Flight flight(5, kCount);
-  const FactorPtr prior = std::make_shared<PosePrior>(X(0), flight.odometry[0], NoiseModel::Isotropic(6, 1e-3));
+  const FactorPtr prior =
+      std::make_shared<PosePrior>(X(0), flight.odometry[0], NoiseModel::Isotropic(6, 1e-3));
   const auto start_of = [&](const FactorList& factors, Values values) {
     for (const FactorPtr& factor : factors) {
       const auto* seen = dynamic_cast<const CylinderFactor*>(factor.get());
       if (seen == nullptr || values.Contains(seen->keys()[1])) continue;
-      values.Insert(seen->keys()[1],
-                    TransformCylinder(values.At<Eigen::Isometry3d>(seen->keys()[0]), seen->measured()));
+      values.Insert(
+          seen->keys()[1],
+          TransformCylinder(values.At<Eigen::Isometry3d>(seen->keys()[0]), seen->measured()));
     }
     return values;
   };
@@ -188,7 +194,8 @@ TEST(ScanSummary, KeyFramesKnowWhatAllScansKnow) {
     const Matrix5d P = full.MarginalCovariance(L(l));
     const Vector5d difference = expected.LocalCoordinates(few.Estimate<Cylinder>(L(l)));
     // Axis and line move by less than their sigmas.
-    for (int i = 0; i < 4; ++i) EXPECT_LT(std::abs(difference[i]), std::sqrt(P(i, i))) << l << " " << i;
+    for (int i = 0; i < 4; ++i)
+      EXPECT_LT(std::abs(difference[i]), std::sqrt(P(i, i))) << l << " " << i;
     // The curvature is no matter of poses: nothing of it is lost.
     EXPECT_NEAR(difference[4], 0.0, 1e-6 * expected.curvature);
     EXPECT_NEAR(few.MarginalCovariance(L(l))(4, 4), P(4, 4), 1e-6 * P(4, 4));
@@ -212,7 +219,8 @@ TEST(ScanSummary, NamesWhatIsMissing) {
   const auto& seen = dynamic_cast<const CylinderFactor&>(*factors.back());
   CylinderParts parts;
   parts.curvature = false;
-  factors.push_back(std::make_shared<CylinderFactor>(X(2), L(99), seen.measured(), seen.covariance(), parts));
+  factors.push_back(
+      std::make_shared<CylinderFactor>(X(2), L(99), seen.measured(), seen.covariance(), parts));
   try {
     SummarizeScans(X(0), X(3), factors, poses);
     FAIL();

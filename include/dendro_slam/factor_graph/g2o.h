@@ -31,14 +31,15 @@ struct PoseGraph {
 };
 
 /// Reads a graph. In a file of edges alone all vertices start at the identity; FIX is read over.
-/// @throws std::runtime_error naming the line, the vertex or edge and what to do, for a tag that is no
-///         SE(3) vertex or edge, a missing or non-finite number, a zero quaternion, or an information
-///         matrix that is not positive definite; UnknownVariableError for an edge to a vertex that is
-///         missing among those given.
+/// @throws std::runtime_error naming the line, the vertex or edge and what to do, for a tag that is
+/// no
+///         SE(3) vertex or edge, a missing or non-finite number, a zero quaternion, or an
+///         information matrix that is not positive definite; UnknownVariableError for an edge to a
+///         vertex that is missing among those given.
 PoseGraph ReadG2o(std::istream& in);
 
-/// The order in which poses can be added one by one, every one but the first with an edge to one before
-/// it: ascending ids, a pose that no edge joins to a lower one as soon as it can be.
+/// The order in which poses can be added one by one, every one but the first with an edge to one
+/// before it: ascending ids, a pose that no edge joins to a lower one as soon as it can be.
 /// @throws UnderconstrainedError naming a pose that is not connected to the first.
 std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph);
 
