@@ -89,8 +89,6 @@ struct WoodIcpNodeConfig {
 
 struct TreeMappingNodeConfig {
   int queue_size = 20;                ///< Scans waiting at most; older ones are dropped. >= 1.
-  bool use_odometry = true;           ///< False: ICP alone.
-  bool use_icp = true;                ///< False: odometry alone.
   std::string map_frame = "map";      ///< Frame of the map.
   std::string output_directory = "";  ///< Where save_map writes when its request names no folder.
   std::string session_directory = "";  ///< Folder where the map is kept against crashes: what was
@@ -114,8 +112,6 @@ struct TreeMappingNodeConfig {
   template <class Visitor>
   void Visit(Visitor&& v) {
     v("queue_size", queue_size);
-    v("use_odometry", use_odometry);
-    v("use_icp", use_icp);
     v("map_frame", map_frame);
     v("output_directory", output_directory);
     v("session_directory", session_directory);
