@@ -307,7 +307,8 @@ class TreeMapping : public nodelet::Nodelet {
   void PublishMap() {
     map_.publish(ToMsg(stage_->model(), config_.map_frame));
     if (path_.getNumSubscribers() > 0) {
-      path_.publish(ToPathMsg(stage_->mapper().Trajectory(), config_.map_frame));
+      const auto most = static_cast<std::size_t>(config_.path_max_poses);
+      path_.publish(ToPathMsg(stage_->mapper().ThinnedTrajectory(most), config_.map_frame));
     }
   }
 
