@@ -744,7 +744,8 @@ std::optional<UncertainMotion> Mapper::Impl::MotionBetween(const std::vector<Fac
 // The next key frame that is old and stands where there are enough others, or -1. Its observations
 // are given up: what is left knows less than all of them did, never more.
 int Mapper::Impl::FindRedundantKeyFrame() {
-  constexpr int kMinOthers = 4;  // Observations that a landmark must keep.
+  constexpr int kMinOthers = 4;  // Observations that a landmark of the map must keep; a candidate, one: most
+                                 // of them go, and no key frame should stay for their sake.
   constexpr int kLater = 5;      // Key frames.
   if (config.key_frames_in_reach == 0) return -1;
   for (; next_judged < num_key_frames - config.key_frame_window; ++next_judged) {
@@ -761,7 +762,10 @@ int Mapper::Impl::FindRedundantKeyFrame() {
       const std::vector<FactorId> factors = solver.FactorsOf(key);
       for (FactorId id : factors) {
         const auto* o = dynamic_cast<const CylinderFactor*>(solver.GetFactor(id).get());
-        if (o != nullptr && solver.NumFactorsOf(o->keys()[1]) <= kMinOthers) redundant = false;
+        if (o == nullptr) continue;
+        const int landmark = static_cast<int>(KeyIndex(o->keys()[1]));
+        const int others = solver.NumFactorsOf(o->keys()[1]) - 1;
+        if (others < (map.Has(landmark) && map.State(landmark).confirmed ? kMinOthers : 1)) redundant = false;
       }
       redundant = redundant && MotionBetween(factors, PoseKey(last_kept), key) &&
                   MotionBetween(factors, key, PoseKey(next_judged + 1));
