@@ -159,7 +159,7 @@ class Mapper::Impl {
 
   MapperResult AddScan(const MapperInput& input);
   MapperResult AddScanWhileLost(const MapperInput& input);
-  std::vector<StampedPose> Trajectory() const;
+  std::vector<StampedPose> Trajectory(std::size_t step = 1) const;
   std::vector<LandmarkState> StatesWithMarginals(bool confirmed_only) const;
   void StartFrom(const MapSnapshot& snapshot, const Eigen::Isometry3d& T_map_lidar);
 
@@ -744,7 +744,8 @@ std::optional<UncertainMotion> Mapper::Impl::MotionBetween(const std::vector<Fac
 // The next key frame that is old and stands where there are enough others, or -1. Its observations
 // are given up: what is left knows less than all of them did, never more.
 int Mapper::Impl::FindRedundantKeyFrame() {
-  constexpr int kMinOthers = 4;  // Observations that a landmark must keep.
+  constexpr int kMinOthers = 4;  // Observations that a landmark of the map must keep; a candidate, one: most
+                                 // of them go, and no key frame should stay for their sake.
   constexpr int kLater = 5;      // Key frames.
   if (config.key_frames_in_reach == 0) return -1;
   for (; next_judged < num_key_frames - config.key_frame_window; ++next_judged) {
@@ -761,7 +762,10 @@ int Mapper::Impl::FindRedundantKeyFrame() {
       const std::vector<FactorId> factors = solver.FactorsOf(key);
       for (FactorId id : factors) {
         const auto* o = dynamic_cast<const CylinderFactor*>(solver.GetFactor(id).get());
-        if (o != nullptr && solver.NumFactorsOf(o->keys()[1]) <= kMinOthers) redundant = false;
+        if (o == nullptr) continue;
+        const int landmark = static_cast<int>(KeyIndex(o->keys()[1]));
+        const int others = solver.NumFactorsOf(o->keys()[1]) - 1;
+        if (others < (map.Has(landmark) && map.State(landmark).confirmed ? kMinOthers : 1)) redundant = false;
       }
       redundant = redundant && MotionBetween(factors, PoseKey(last_kept), key) &&
                   MotionBetween(factors, key, PoseKey(next_judged + 1));
@@ -1210,10 +1214,13 @@ MapperResult Mapper::Impl::AddScanWhileLost(const MapperInput& input) {
   return result;
 }
 
-std::vector<StampedPose> Mapper::Impl::Trajectory() const {
+// Every `step`-th pose from the first on, and the last.
+std::vector<StampedPose> Mapper::Impl::Trajectory(std::size_t step) const {
   std::vector<StampedPose> out;
-  out.reserve(trajectory.size());
-  for (const TrajectoryEntry& entry : trajectory) {
+  out.reserve(trajectory.size() / step + 2);
+  for (std::size_t i = 0; i < trajectory.size(); ++i) {
+    if (i % step != 0 && i + 1 != trajectory.size()) continue;
+    const TrajectoryEntry& entry = trajectory[i];
     const Eigen::Isometry3d& T = solver.Estimate<Eigen::Isometry3d>(PoseKey(entry.key_frame));
     out.push_back({entry.stamp_ns, NormalizedSe3(T * entry.T_kf_lidar)});
   }
@@ -1265,6 +1272,16 @@ std::vector<Landmark> Mapper::AllLandmarks() const {
 
 std::vector<StampedPose> Mapper::Trajectory() const {
   return impl_->pending ? impl_->local->Trajectory() : impl_->Trajectory();
+}
+std::vector<StampedPose> Mapper::ThinnedTrajectory(std::size_t most) const {
+  if (impl_->pending) return impl_->local->ThinnedTrajectory(most);
+  std::size_t step = 1;
+  // The last one comes on top of every step-th.
+  while (impl_->trajectory.size() / step + 2 > std::max<std::size_t>(most, 3) &&
+         step < impl_->trajectory.size()) {
+    step *= 2;
+  }
+  return impl_->Trajectory(step);
 }
 Eigen::Isometry3d Mapper::T_map_odom() const {
   return impl_->pending ? impl_->local->T_map_odom() : impl_->T_map_odom;

@@ -228,8 +228,9 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
   MapperInput input;
   input.stamp_ns = scan.stamp_ns;
   input.cylinders = result.cylinders;
-  input.icp = result.icp;
-  if (const auto T_odom_base = mapping_poses_.Lookup(scan.stamp_ns)) {
+  if (config_.tree_mapping.use_icp) input.icp = result.icp;
+  const auto T_odom_base = mapping_poses_.Lookup(scan.stamp_ns);
+  if (T_odom_base && config_.tree_mapping.use_odometry) {
     input.T_odom_lidar = *T_odom_base * T_base_lidar_;
     result.had_odometry = true;
   }

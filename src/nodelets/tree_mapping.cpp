@@ -79,11 +79,11 @@ class TreeMapping : public nodelet::Nodelet {
           "stage_latency", 1000, [this](const dendro_slam::StageLatencyConstPtr& latency) {
             latencies_.Add(*latency);
           });
-      if (config_.use_odometry) {
+      if (config_.stage.use_odometry) {
         odometry_subscriber_ = nh.subscribe<nav_msgs::Odometry>(
             "odometry", 1000, [this](const Odometry& msg) { worker_->Push(msg, false); });
       }
-      if (config_.use_icp) {
+      if (config_.stage.use_icp) {
         icp_subscriber_ = nh.subscribe<nav_msgs::Odometry>(
             "icp_odometry", 1000, [this](const Odometry& msg) {
               worker_->Push(IcpOdometry{msg}, false);
@@ -143,7 +143,7 @@ class TreeMapping : public nodelet::Nodelet {
   }
 
   void AddCylinders(const Cylinders& cylinders) {
-    if (config_.use_icp) {
+    if (config_.stage.use_icp) {
       join_->AddFirst(ToNs(cylinders->header.stamp), cylinders);
     } else {
       AddToGate({cylinders, nullptr});
@@ -307,7 +307,8 @@ class TreeMapping : public nodelet::Nodelet {
   void PublishMap() {
     map_.publish(ToMsg(stage_->model(), config_.map_frame));
     if (path_.getNumSubscribers() > 0) {
-      path_.publish(ToPathMsg(stage_->mapper().Trajectory(), config_.map_frame));
+      const auto most = static_cast<std::size_t>(config_.path_max_poses);
+      path_.publish(ToPathMsg(stage_->mapper().ThinnedTrajectory(most), config_.map_frame));
     }
   }
 

@@ -423,6 +423,23 @@ TEST(Mapper, ManyLapsLeaveAGraphOfOne) {
   EXPECT_LT(mapper.num_kept_key_frames(), 150);
 }
 
+TEST(Mapper, TheThinnedPathIsShortAndEndsWhereThePathDoes) {
+  World world(ThesisLikeTree(), 20);
+  Mapper mapper;
+  EXPECT_TRUE(mapper.ThinnedTrajectory(10).empty());
+  FlightOptions options;
+  options.scans = 150;
+  Fly(&mapper, &world, options);
+  const std::vector<StampedPose> all = mapper.Trajectory();
+  ASSERT_EQ(all.size(), 150u);
+  EXPECT_EQ(mapper.ThinnedTrajectory(200).size(), 150u);
+  const std::vector<StampedPose> thin = mapper.ThinnedTrajectory(50);
+  ASSERT_EQ(thin.size(), 39u);  // Every fourth, from 0 to 148, and number 149.
+  for (std::size_t i = 0; i + 1 < thin.size(); ++i) EXPECT_EQ(thin[i].stamp_ns, all[4 * i].stamp_ns);
+  EXPECT_EQ(thin.back().stamp_ns, all.back().stamp_ns);
+  EXPECT_EQ(thin.back().T_map_lidar.matrix(), all.back().T_map_lidar.matrix());
+}
+
 TEST(Mapper, SameInputSameBytes) {
   std::vector<Landmark> maps[2];
   for (auto& map : maps) {

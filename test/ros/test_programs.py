@@ -118,6 +118,16 @@ def test_map_bag_goes_on_with_a_map(bag, tmp_path):
     good("map_bag", bag, "-o", tmp_path / "b", "--load", tmp_path / "a")
 
 
+def test_what_is_switched_off_is_not_mapped_with(bag, tmp_path):
+    good("map_bag", bag, "-o", tmp_path / "both")
+    for switch in ("use_icp", "use_odometry"):
+        config = tmp_path / f"{switch}.yaml"
+        config.write_text(f"tree_mapping: {{{switch}: false}}\n")
+        good("map_bag", bag, "-o", tmp_path / switch, "--config", config)
+    paths = [(tmp_path / name / "trajectory.tum").read_bytes() for name in ("both", "use_icp", "use_odometry")]
+    assert len(set(paths)) == 3
+
+
 def test_bag_without_odometry(tmp_path):
     path = tmp_path / "none.bag"
     good("simulate_bag", SCENE, PATH, "-o", path, "--duration", 2, "--odometry", "none")

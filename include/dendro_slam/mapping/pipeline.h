@@ -45,6 +45,8 @@ struct WoodSegmentationConfig {
 
 /// Settings of the stage from cylinders to the map.
 struct TreeMappingConfig {
+  bool use_odometry = true;         ///< False: ICP alone.
+  bool use_icp = true;              ///< False: odometry alone.
   double odometry_timeout_s = 0.5;  ///< Scans go on without odometry after this silence [s]. > 0.
   MapperConfig mapper;
   TopologyConfig topology;
@@ -55,6 +57,8 @@ struct TreeMappingConfig {
   void Validate() const;
   template <class Visitor>
   void Visit(Visitor&& v) {
+    v("use_odometry", use_odometry);
+    v("use_icp", use_icp);
     v("odometry_timeout_s", odometry_timeout_s);
     v("mapper", mapper);
     v("topology", topology);

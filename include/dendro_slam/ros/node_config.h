@@ -89,8 +89,6 @@ struct WoodIcpNodeConfig {
 
 struct TreeMappingNodeConfig {
   int queue_size = 20;                ///< Scans waiting at most; older ones are dropped. >= 1.
-  bool use_odometry = true;           ///< False: ICP alone.
-  bool use_icp = true;                ///< False: odometry alone.
   std::string map_frame = "map";      ///< Frame of the map.
   std::string output_directory = "";  ///< Where save_map writes when its request names no folder.
   std::string session_directory = "";  ///< Folder where the map is kept against crashes: what was
@@ -100,6 +98,8 @@ struct TreeMappingNodeConfig {
   bool resume = false;          ///< Go on with the map of an earlier run in that folder too: it is
                                 ///< loaded, and used once the place is recognised.
   double autosave_s = 60.0;     ///< The map directory in that folder is written this often [s]. > 0.
+  int path_max_poses = 5000;          ///< In the topic `path`; of a longer one every second, fourth, ... pose is
+                                      ///< shown. The saved trajectory has all. >= 3.
   bool publish_tf = true;             ///< Publish map -> odom (map -> lidar without odometry).
   bool publish_odometry_tf = false;   ///< Publish odom -> body too, where nobody else does.
   LidarMountConfig lidar_mount;
@@ -109,19 +109,19 @@ struct TreeMappingNodeConfig {
     CheckQueueSize(queue_size);
     if (map_frame.empty()) throw std::invalid_argument("map_frame must not be empty");
     if (!(autosave_s > 0.0)) throw std::invalid_argument("autosave_s must be positive");
+    if (path_max_poses < 3) throw std::invalid_argument("path_max_poses must be at least 3");
     stage.Validate();
   }
   template <class Visitor>
   void Visit(Visitor&& v) {
     v("queue_size", queue_size);
-    v("use_odometry", use_odometry);
-    v("use_icp", use_icp);
     v("map_frame", map_frame);
     v("output_directory", output_directory);
     v("session_directory", session_directory);
     v("session_id", session_id);
     v("resume", resume);
     v("autosave_s", autosave_s);
+    v("path_max_poses", path_max_poses);
     v("publish_tf", publish_tf);
     v("publish_odometry_tf", publish_odometry_tf);
     v("lidar_mount", lidar_mount);
