@@ -49,8 +49,14 @@ LAYERS = ("stem:16:3x5:1x2 push "
           "grow:32:1x1:2x2 add conv:32:3x3 "
           "grow:16:1x1:2x2 add conv:32:3x3 "
           "last:4:1x1:1x2")
-# A pixel of the thesis' image is a whole degree: no azimuth to spare for a stride in the input layer.
-LAYERS_32X360 = LAYERS.replace("stem:16:3x5:1x2", "stem:16:3x5:1x1").replace("last:4:1x1:1x2", "last:4:1x1:1x1")
+# A pixel of the thesis' image is a whole degree: no azimuth to spare for a stride in the input layer. Two
+# blocks more than above, which the small image leaves time for.
+LAYERS_32X360 = ("stem:16:3x5:1x1 push "
+                 "down:32:2x2 nb:1x1 nb:1x2 push "
+                 "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
+                 "grow:32:1x1:2x2 add conv:32:3x3 nb:1x1 "
+                 "grow:16:1x1:2x2 add conv:32:3x3 "
+                 "last:4:1x1:1x1")
 FIXTURE_LAYERS = ("stem:6:3x5:1x2 nb:1x1 push down:10:2x2 nb:1x2 push down:14:2x1 nb:2x4 "
                   "grow:10:1x1:2x1 add conv:7:3x5 grow:6:3x3:2x2 add last:4:1x3:1x2")
 
@@ -324,6 +330,23 @@ def load_exported(path):
 
 
 @torch.no_grad()
+def deepened(net, layers):
+    """The same function with the layers `layers`: blocks it has beyond those of `net` add nothing as yet."""
+    result = ErfNet(layers)
+    old = list(zip(net.words, net.layers))
+    for word, layer in zip(result.words, result.layers):
+        if old and old[0][0] == word:
+            layer.load_state_dict(old.pop(0)[1].state_dict())
+        elif word.startswith("nb:"):
+            layer.bn2.weight.zero_()
+        else:
+            raise SystemExit("train_segmentation: --init is of another architecture")
+    if old:
+        raise SystemExit("train_segmentation: --init is of another architecture")
+    return result.eval()
+
+
+@torch.no_grad()
 def unfold(net, inputs):
     """Gives the batch normalisations of load_exported() the statistics of `inputs` back.
 
@@ -386,8 +409,25 @@ class Dataset:
                 self.labels[index][:, columns])
 
 
+def head_down(x, y):
+    """The same scan by a sensor that hangs head down and is mirrored: the rows in reverse order.
+
+    What was the step from the row below is now the step to the next row. (Head down the azimuths run
+    the other way too, which the mirror of augment() sees to or not.)
+    """
+    x, y = x[:, ::-1].copy(), y[::-1].copy()
+    mask = x[MASK] > 0.5
+    both = mask[:-1] & mask[1:]
+    for plane, sign, missing in ((VERTICAL, -1.0, 1.0), (RISE, 1.0, 0.0)):
+        step = x[plane].copy()
+        x[plane, :-1] = np.where(both, sign * step[1:], missing)
+        x[plane, -1] = missing
+        x[plane][~mask] = 0.0
+    return x, y
+
+
 def augment(x, y, rng):
-    """Yaw comes from the crop's place; here mirror, range scale, drop-out, intensity, ground.
+    """Yaw comes from the crop's place; here mirror, head down, range scale, drop-out, intensity, ground.
 
     The planes of the runs stay as they are where a return is dropped: they would seldom change much.
     """
@@ -402,6 +442,9 @@ def augment(x, y, rng):
         # A pixel whose new neighbour was missing had been that neighbour's business: far.
         x[LATERAL, :, -1] = np.where(mask[:, -1], 1.0, 0.0)
         y[:, -1] = IGNORE
+    if rng.random() < 0.25:
+        x, y = head_down(x, y)
+        mask = x[MASK] > 0.5
     scale = np.exp(rng.uniform(-0.25, 0.25)) if rng.random() < 0.7 else 1.0
     if scale != 1.0:
         x[RANGE] += mask * (0.5 * np.log2(scale))
@@ -428,7 +471,9 @@ def augment(x, y, rng):
     if rng.random() < 0.15:
         x[INTENSITY] = x[BRIGHTNESS] = -0.5 * mask
     else:
-        gain = np.exp(rng.uniform(-0.4, 0.4))
+        # Of the whole scan, and of each class by itself: leaves and bark of other plants.
+        own = np.exp(rng.uniform(-0.2, 0.2, len(CLASSES))) if rng.random() < 0.5 else np.ones(len(CLASSES))
+        gain = (np.exp(rng.uniform(-0.4, 0.4)) * own)[np.where(y == IGNORE, OTHER, y)]
         for plane in (INTENSITY, BRIGHTNESS):
             x[plane] = np.clip((x[plane] + 0.5) * gain, 0.0, 2.0) * mask - 0.5 * mask
     if rng.random() < 0.1:
@@ -486,8 +531,8 @@ def fine_loss(logits, target, x):
                          weight=CLASS_WEIGHT.to(logits.device), reduction="none")
     valid = (target != IGNORE).float()
     wood = (target == WOOD).float()
-    # Far returns are few, but what is found far away is found early: they count half as much again.
-    weight = valid * (1.0 + 0.5 * (x[:, RANGE] > FAR))
+    # Far returns are few, but what is found far away is found early: they count twice.
+    weight = valid * (1.0 + 1.0 * (x[:, RANGE] > FAR))
     total = (weight * CLASS_WEIGHT.to(logits.device)[torch.where(target == IGNORE, 0, target)]).sum()
     p = logits.softmax(1)[:, WOOD] * valid
     both = (p * wood).sum()
@@ -616,9 +661,7 @@ def train(args):
     else:
         saved = None
         if args.init:
-            net = load_exported(args.init)
-            if net.spec != args.layers:
-                raise SystemExit("train_segmentation: --init is of another architecture")
+            net = deepened(load_exported(args.init), args.layers)
             rng = np.random.default_rng([args.seed, 1 << 20])
             unfold(net, [x for x, _ in batches(training, rng, 30, args.batch, args.width)])
             net = net.to(device, memory_format=torch.channels_last)
@@ -829,7 +872,8 @@ def main():
                         help="default: if it is faster on this CPU")
     parser.add_argument("--threads", type=int, default=max(1, os.cpu_count() or 1))
     parser.add_argument("--init", type=pathlib.Path, metavar="FILE",
-                        help="go on from these weights in the joint step, with a new learning rate")
+                        help="go on from these weights in the joint step, with a new learning rate; "
+                             "blocks nb they lack begin as ones that do nothing")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--checkpoint", default="checkpoint.pt")
     parser.add_argument("--resume", action="store_true")

@@ -10,6 +10,8 @@
 #include <opencv2/core/utility.hpp>
 #include <opencv2/dnn.hpp>
 
+#include "dendro_slam/segmentation/convolution.h"
+
 namespace dendro {
 namespace {
 
@@ -85,12 +87,65 @@ class InterleaveLayer : public cv::dnn::Layer {
   int stride_h_, stride_w_;
 };
 
-constexpr const char* kInterleave = "DendroInterleave";
+// A convolution (see convolution.h), with the sum with a second input and the ReLU that may follow it.
+class ConvolutionLayer : public cv::dnn::Layer {
+ public:
+  explicit ConvolutionLayer(const cv::dnn::LayerParams& params)
+      : convolution_(ShapeOf(params), params.blobs.at(0).ptr<float>(),
+                     params.blobs.at(1).ptr<float>(), params.get<bool>("relu")) {
+    setParamsFrom(params);
+  }
+  static cv::Ptr<cv::dnn::Layer> Create(cv::dnn::LayerParams& params) {
+    return cv::makePtr<ConvolutionLayer>(params);
+  }
+  bool getMemoryShapes(const std::vector<cv::dnn::MatShape>& inputs,
+                       int /*required_outputs*/,
+                       std::vector<cv::dnn::MatShape>& outputs,
+                       std::vector<cv::dnn::MatShape>& /*internals*/) const override {
+    const ConvolutionShape& shape = convolution_.shape();
+    const cv::dnn::MatShape& in = inputs.at(0);
+    outputs.assign(
+        1, {in[0], shape.outputs, shape.OutputRows(in[2]), shape.OutputCols(in[3])});
+    return false;  // Not in place.
+  }
+  void forward(cv::InputArrayOfArrays inputs,
+               cv::OutputArrayOfArrays outputs,
+               cv::OutputArrayOfArrays /*internals*/) override {
+    std::vector<cv::Mat> in;
+    std::vector<cv::Mat> out;
+    inputs.getMatVector(in);
+    outputs.getMatVector(out);
+    convolution_.Run(in[0].ptr<float>(), in[0].size[2], in[0].size[3],
+                     in.size() > 1 ? in[1].ptr<float>() : nullptr, out[0].ptr<float>());
+  }
 
-void RegisterInterleave() {
+ private:
+  static ConvolutionShape ShapeOf(const cv::dnn::LayerParams& params) {
+    ConvolutionShape shape;
+    shape.outputs = params.blobs.at(0).size[0];
+    shape.inputs = params.blobs.at(0).size[1];
+    shape.kernel_h = params.get<int>("kernel_h");
+    shape.kernel_w = params.get<int>("kernel_w");
+    shape.stride_h = params.get<int>("stride_h");
+    shape.stride_w = params.get<int>("stride_w");
+    shape.dilation_h = params.get<int>("dilation_h");
+    shape.dilation_w = params.get<int>("dilation_w");
+    shape.pad_h = params.get<int>("pad_h");
+    shape.pad_w = params.get<int>("pad_w");
+    return shape;
+  }
+
+  Convolution convolution_;
+};
+
+constexpr const char* kInterleave = "DendroInterleave";
+constexpr const char* kConvolution = "DendroConvolution";
+
+void RegisterLayers() {
   // OpenCV's table of layer types is global and guards itself; a type may be registered once.
   static const bool registered = [] {
     cv::dnn::LayerFactory::registerLayer(kInterleave, InterleaveLayer::Create);
+    cv::dnn::LayerFactory::registerLayer(kConvolution, ConvolutionLayer::Create);
     return true;
   }();
   static_cast<void>(registered);
@@ -139,14 +194,22 @@ class Builder {
     params->set("dilation_w", window.dilation_w);
   }
 
-  int Convolution(const std::string& name, int input, int in, int out, const Window& window) {
+  // @param summand  Layer whose output is added before the ReLU, or -1.
+  int Convolution(const std::string& name,
+                  int input,
+                  int in,
+                  int out,
+                  const Window& window,
+                  bool relu,
+                  int summand = -1) {
     cv::dnn::LayerParams params;
     SetWindow(window, &params);
-    params.set("num_output", out);
-    params.set("bias_term", true);
+    params.set("relu", relu);
     params.blobs.push_back(Blob(name + ".weight", {out, in, window.kernel_h, window.kernel_w}));
     params.blobs.push_back(Blob(name + ".bias", {out}));
-    return Add(name, "Convolution", params, {input});
+    std::vector<int> inputs = {input};
+    if (summand >= 0) inputs.push_back(summand);
+    return Add(name, kConvolution, params, inputs);
   }
 
   int Pool(const std::string& name, int input, int channels, int stride_h, int stride_w) {
@@ -262,7 +325,7 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
   const std::vector<ErfNetLayer> layers =
       ParseErfNetLayers(weights.Metadata("layers"), weights.name());
   if (layers.empty() || layers.back().type != "last") fail("does not end in a 'last' layer");
-  RegisterInterleave();
+  RegisterLayers();
 
   struct Shape {
     int id, channels, scale_h, scale_w;  // Scale: how many input pixels one pixel stands for.
@@ -282,13 +345,12 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
     window.pad_w = layer.kernel_w / 2;
     if (layer.type == "stem" || layer.type == "conv") {
       const int conv =
-          builder.Convolution(name + ".conv", at.id, at.channels, layer.channels, window);
-      at = {builder.Relu(name + ".relu", conv), layer.channels, at.scale_h * layer.stride_h,
-            at.scale_w * layer.stride_w};
+          builder.Convolution(name + ".conv", at.id, at.channels, layer.channels, window, true);
+      at = {conv, layer.channels, at.scale_h * layer.stride_h, at.scale_w * layer.stride_w};
     } else if (layer.type == "down") {
       if (layer.channels <= at.channels) fail(fmt::format("layer {} must add channels", i));
       const int added = layer.channels - at.channels;
-      const int conv = builder.Convolution(name + ".conv", at.id, at.channels, added, window);
+      const int conv = builder.Convolution(name + ".conv", at.id, at.channels, added, window, false);
       const int pool =
           builder.Pool(name + ".pool", at.id, at.channels, layer.stride_h, layer.stride_w);
       cv::dnn::LayerParams concat;
@@ -310,17 +372,10 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
         return w;
       };
       const int c = at.channels;
-      int id = builder.Convolution(name + ".conv1", at.id, c, c, column(1));
-      id = builder.Relu(name + ".relu1", id);
-      id = builder.Convolution(name + ".conv2", id, c, c, row(1));
-      id = builder.Relu(name + ".relu2", id);
-      id = builder.Convolution(name + ".conv3", id, c, c, column(layer.dilation_h));
-      id = builder.Relu(name + ".relu3", id);
-      id = builder.Convolution(name + ".conv4", id, c, c, row(layer.dilation_w));
-      cv::dnn::LayerParams sum;
-      sum.set("operation", "sum");
-      id = builder.Add(name + ".sum", "Eltwise", sum, {id, at.id});
-      at.id = builder.Relu(name + ".relu", id);
+      int id = builder.Convolution(name + ".conv1", at.id, c, c, column(1), true);
+      id = builder.Convolution(name + ".conv2", id, c, c, row(1), true);
+      id = builder.Convolution(name + ".conv3", id, c, c, column(layer.dilation_h), true);
+      at.id = builder.Convolution(name + ".conv4", id, c, c, row(layer.dilation_w), true, at.id);
     } else if (layer.type == "push") {
       kept.push_back(at);
     } else if (layer.type == "add") {
@@ -338,9 +393,8 @@ ErfNet::ErfNet(const TensorFile& weights) : impl_(std::make_unique<Impl>()) {
       }
       const int copies = layer.stride_h * layer.stride_w;
       window.stride_h = window.stride_w = 1;
-      int id =
-          builder.Convolution(name + ".conv", at.id, at.channels, layer.channels * copies, window);
-      if (layer.type == "grow") id = builder.Relu(name + ".relu", id);
+      int id = builder.Convolution(name + ".conv", at.id, at.channels, layer.channels * copies,
+                                   window, layer.type == "grow");
       if (copies > 1) id = builder.Interleave(name + ".pixels", id, layer.stride_h, layer.stride_w);
       at = {id, layer.channels, at.scale_h / layer.stride_h, at.scale_w / layer.stride_w};
     }

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <random>
 #include <stdexcept>
 #include <vector>
@@ -22,17 +23,54 @@ struct Score {
   float below = 0.0F;
 };
 
-Score Evaluate(const GroundPlane& plane,
-               const std::vector<Eigen::Vector3f>& points,
-               const std::vector<float>& weights,
-               float distance) {
+// The returns looked at, coordinate by coordinate: hundreds of planes are tried on all of them. Filled
+// up to whole blocks with returns of no weight.
+struct Sample {
+  static constexpr std::size_t kBlock = 8;
+  std::vector<float> x, y, z, weight;
+
+  void Add(const Eigen::Vector3f& p, float w) {
+    x.push_back(p.x());
+    y.push_back(p.y());
+    z.push_back(p.z());
+    weight.push_back(w);
+  }
+  void FillUp() {
+    while (x.size() % kBlock != 0) Add(Eigen::Vector3f::Zero(), 0.0F);
+  }
+  Eigen::Vector3f Point(std::size_t i) const { return {x[i], y[i], z[i]}; }
+};
+
+Score Evaluate(const GroundPlane& plane, const Sample& sample, float distance) {
+  // Written with vectors (of the compiler's) because the compiler does not find them by itself here.
+  using Vector = float __attribute__((vector_size(16)));
+  constexpr std::size_t kLanes = sizeof(Vector) / sizeof(float);
+  constexpr std::size_t kVectors = Sample::kBlock / kLanes;
+  Vector inliers[kVectors] = {};
+  Vector below[kVectors] = {};
+  const float nx = plane.normal.x();
+  const float ny = plane.normal.y();
+  const float nz = plane.normal.z();
+  const auto load = [](const std::vector<float>& from, std::size_t i) {
+    Vector v;
+    std::memcpy(&v, from.data() + i, sizeof(v));
+    return v;
+  };
+  for (std::size_t i = 0; i < sample.x.size(); i += Sample::kBlock) {
+    for (std::size_t v = 0; v < kVectors; ++v) {
+      const std::size_t k = i + v * kLanes;
+      const Vector weight = load(sample.weight, k);
+      const Vector height = nx * load(sample.x, k) + ny * load(sample.y, k) +
+                            nz * load(sample.z, k) + plane.offset;
+      inliers[v] += ((height <= distance) & (height >= -distance)) ? weight : Vector{};
+      below[v] += height < -kBelowFactor * distance ? weight : Vector{};
+    }
+  }
   Score score;
-  for (std::size_t i = 0; i < points.size(); ++i) {
-    const float height = plane.Height(points[i]);
-    if (std::abs(height) <= distance) {
-      score.inliers += weights[i];
-    } else if (height < -kBelowFactor * distance) {
-      score.below += weights[i];
+  for (std::size_t v = 0; v < kVectors; ++v) {
+    for (std::size_t k = 0; k < kLanes; ++k) {
+      score.inliers += inliers[v][k];
+      score.below += below[v][k];
     }
   }
   return score;
@@ -78,14 +116,14 @@ std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
   // Every k-th return, with k odd so that no row is systematically favoured.
   std::size_t step = pixels.size() / kMaxSamples + 1;
   if (step % 2 == 0) ++step;
-  std::vector<Eigen::Vector3f> points;
-  std::vector<float> weights;
+  Sample sample;
   float total = 0.0F;
   for (std::size_t i = 0; i < pixels.size(); i += step) {
-    points.push_back(image.point[pixels[i]]);
-    weights.push_back(image.range[pixels[i]]);
-    total += weights.back();
+    sample.Add(image.point[pixels[i]], image.range[pixels[i]]);
+    total += image.range[pixels[i]];
   }
+  const std::size_t sampled = sample.x.size();
+  sample.FillUp();
   const float distance = static_cast<float>(config.inlier_distance_m);
 
   std::mt19937 rng(20240531U);
@@ -130,7 +168,7 @@ std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
       plane.offset = -plane.offset;
     }
     if (plane.offset < 0.1F) continue;
-    const Score score = Evaluate(plane, points, weights, distance);
+    const Score score = Evaluate(plane, sample, distance);
     if (score.below > static_cast<float>(config.max_below_ratio) * total) continue;
     const float value = (score.inliers - 2.0F * score.below) *
                         (1.0F + kUprightBonus * std::abs(plane.normal.z()));
@@ -145,7 +183,8 @@ std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
     Eigen::Vector3d mean = Eigen::Vector3d::Zero();
     Eigen::Matrix3d second_moment = Eigen::Matrix3d::Zero();
     double n = 0.0;
-    for (const Eigen::Vector3f& p : points) {
+    for (std::size_t i = 0; i < sampled; ++i) {
+      const Eigen::Vector3f p = sample.Point(i);
       if (std::abs(best->Height(p)) > distance) continue;
       const Eigen::Vector3d q = p.cast<double>();
       mean += q;
@@ -173,7 +212,7 @@ std::optional<GroundPlane> EstimateWithin(const RangeImage& image,
   const auto columns = std::count(seen.begin(), seen.end(), 1);
   if (static_cast<double>(columns) < config.min_column_ratio * image.cols) return std::nullopt;
 
-  const Score score = Evaluate(*best, points, weights, distance);
+  const Score score = Evaluate(*best, sample, distance);
   if (best->offset < 0.1F ||
       score.inliers < static_cast<float>(config.min_inlier_ratio) * total ||
       score.below > static_cast<float>(config.max_below_ratio) * total) {

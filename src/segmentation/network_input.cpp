@@ -82,7 +82,8 @@ void FindRuns(const RangeImage& image, int row, std::vector<Run>* runs, std::vec
     const std::size_t i = image.Index(row, col);
     const std::size_t next = image.Index(row, col + 1 < cols ? col + 1 : 0);
     if (!has(i) || !has(next)) return false;
-    const float column_width = static_cast<float>(2.0 * kPi) / static_cast<float>(cols) * image.range[i];
+    const float column_width =
+        static_cast<float>(2.0 * kPi) / static_cast<float>(cols) * image.range[i];
     return std::abs(image.range[next] - image.range[i]) <= 0.05F + 2.0F * column_width;
   };
   int start = 0;  // The first column of a run, or any if the whole row is one.

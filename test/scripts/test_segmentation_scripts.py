@@ -61,3 +61,43 @@ def test_unfolded_weights_compute_what_the_exported_ones_do():
         seen = torch.cat([net.layers[0].conv(x) for x in inputs])
         assert torch.allclose(norm.running_mean, seen.mean((0, 2, 3)), atol=1e-4)
         assert torch.allclose(net(inputs[0]), expected, atol=1e-3 * float(expected.abs().max()))
+
+
+def test_added_blocks_change_nothing_until_they_are_trained():
+    import torch
+    net = training.ErfNet("stem:16:3x5:1x2 push down:32:2x2 nb:1x2 grow:16:1x1:2x2 add last:4:1x1:1x2").eval()
+    deeper = training.deepened(net, "stem:16:3x5:1x2 push down:32:2x2 nb:1x1 nb:1x2 nb:1x4 "
+                                    "grow:16:1x1:2x2 add last:4:1x1:1x2")
+    x = torch.randn(1, training.PLANES, 16, 64)
+    with torch.no_grad():
+        assert torch.allclose(deeper(x), net(x), atol=1e-5)
+    # They are not lost for the training either.
+    deeper.train()(x).square().sum().backward()
+    assert float(deeper.layers[3].bn2.weight.grad.abs().max()) > 0.0
+    with pytest.raises(SystemExit):
+        training.deepened(net, net.spec.replace("down:32", "down:24"))
+
+
+def test_head_down_steps_point_to_the_row_that_is_next():
+    import numpy as np
+    rng = np.random.default_rng(5)
+    mask = rng.random((16, 40)) < 0.8
+    distance, z = rng.uniform(1.0, 9.0, (16, 40)), rng.uniform(-1.0, 1.0, (16, 40))
+
+    def planes(mask, distance, z):
+        """The planes that depend on the next row, from their definition in network_input.h."""
+        x = np.zeros((training.PLANES, 16, 40))
+        for row, col in zip(*np.nonzero(mask)):
+            x[training.MASK, row, col] = x[training.VERTICAL, row, col] = 1.0
+            if row + 1 < 16 and mask[row + 1, col]:
+                for plane, value in ((training.VERTICAL, distance), (training.RISE, z)):
+                    d = value[row + 1, col] - value[row, col]
+                    x[plane, row, col] = d / (abs(d) + 0.2)
+        return x
+
+    y = rng.integers(0, 4, (16, 40)).astype(np.uint8)
+    flipped, labels = training.head_down(planes(mask, distance, z), y)
+    # Head down the sensor's z points the other way.
+    expected = planes(mask[::-1], distance[::-1], -z[::-1])
+    assert np.allclose(flipped, expected)
+    assert (labels == y[::-1]).all()

@@ -36,8 +36,9 @@ std::vector<ErfNetLayer> ParseErfNetLayers(const std::string& text, const std::s
 
 /// An ERFNet (Romera et al. 2018) for range images, run by OpenCV's DNN module on the CPU.
 ///
-/// The network is built layer by layer from a safetensors file whose batch normalisations are
-/// folded into the convolutions (the pooling half of a downsampler keeps its own scale and shift).
+/// The network is built layer by layer, convolutions (convolution.h) and enlarging as layers of our own,
+/// from a safetensors file whose batch normalisations are folded into the convolutions (the pooling
+/// half of a downsampler keeps its own scale and shift).
 /// Owns one cv::dnn::Net; not thread-safe: one instance per thread. Stage 1.
 class ErfNet {
  public:
