@@ -263,7 +263,8 @@ class SegmentFit {
   const CylinderFitterConfig& config_;
   std::vector<Beam> beams_;
   std::vector<Edge> edges_;
-  std::vector<Edge> hidden_edges_;  // Where the segment ends and another surface goes on.
+  std::vector<Edge> backed_edges_;  // The same before a surface so close that both mix.
+  std::vector<Edge> hidden_edges_;  // Where the segment ends and this surface or a nearer one goes on.
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();  // Mean optical centre.
   Eigen::Vector3d centroid_ = Eigen::Vector3d::Zero();
   double bright_ = 0.0;  // Intensity of a full hit.
@@ -358,7 +359,7 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
         static_cast<double>((image_.point[next] - image_.beam_origin[next]).norm());
     // A nearer surface hides the silhouette; one close behind mixes with it.
     if (!(behind > range + std::max(config_.echo_separation_m, 6.0 * config_.range_sigma_m))) {
-      hidden_edges_.push_back(edge);
+      (behind > range + 6.0 * config_.range_sigma_m ? backed_edges_ : hidden_edges_).push_back(edge);
       return;
     }
     const double brightness = image_.intensity.size() == image_.size()
@@ -719,7 +720,11 @@ bool SegmentFit::SeesASide(const BentCone& bent) const {
       ++ends[side];
     }
   };
+  // Mixed returns at both limbs leave nothing of what is only a few columns wide.
+  constexpr double kWideColumns = 10.0;
+  const double columns = 2.0 * bent.middle.radius / ((centroid_ - origin_).norm() * 2.0 * M_PI / image_.cols);
   count(edges_, 1);
+  count(backed_edges_, columns >= kWideColumns ? 1 : 0);
   count(hidden_edges_, 0);
   return 2 * seen[0] > ends[0] || 2 * seen[1] > ends[1];
 }

@@ -27,7 +27,7 @@ const char* ToString(UnresolvedReason reason) {
     case UnresolvedReason::kNonFinite:
       return "non-finite input";
     case UnresolvedReason::kArcTooSmall:
-      return "visible arc too small";
+      return "too little of the surface seen";
     case UnresolvedReason::kNotACylinder:
       return "not a cylinder";
     case UnresolvedReason::kRadiusOutOfRange:

@@ -760,12 +760,16 @@ int Mapper::Impl::FindRedundantKeyFrame() {
     bool redundant = CountKeptAround(position) >= config.key_frames_in_reach;
     if (redundant) {
       const std::vector<FactorId> factors = solver.FactorsOf(key);
+      // Two segments of one scan may lie on one landmark.
+      std::map<Key, int> of_landmark;
       for (FactorId id : factors) {
         const auto* o = dynamic_cast<const CylinderFactor*>(solver.GetFactor(id).get());
-        if (o == nullptr) continue;
-        const int landmark = static_cast<int>(KeyIndex(o->keys()[1]));
-        const int others = solver.NumFactorsOf(o->keys()[1]) - 1;
-        if (others < (map.Has(landmark) && map.State(landmark).confirmed ? kMinOthers : 1)) redundant = false;
+        if (o != nullptr) ++of_landmark[o->keys()[1]];
+      }
+      for (const auto& [landmark, count] : of_landmark) {
+        const int id = static_cast<int>(KeyIndex(landmark));
+        const int others = solver.NumFactorsOf(landmark) - count;
+        if (others < (map.Has(id) && map.State(id).confirmed ? kMinOthers : 1)) redundant = false;
       }
       redundant = redundant && MotionBetween(factors, PoseKey(last_kept), key) &&
                   MotionBetween(factors, key, PoseKey(next_judged + 1));

@@ -47,6 +47,9 @@ void Cover(LandmarkState* state, double s_begin, double s_end, double cell) {
   for (int k = first; k <= last; ++k) ++state->coverage[static_cast<std::size_t>(k - state->first_cell)];
 }
 
+// What lies so far from a landmark's line, or half of its radius, is on it [m].
+constexpr double kOnLineM = 0.01;
+
 struct Extent {
   double begin = 0.0, end = 0.0;
 };
@@ -389,10 +392,23 @@ void TreeMap::Observe(int id,
   const Cylinder in_map = TransformCylinder(T_map_lidar, observation.cylinder);
   const double sign = in_map.axis.dot(state->line.axis) < 0.0 ? -1.0 : 1.0;
   const double s = (in_map.point - state->line.point).dot(state->line.axis);
-  // Only the part of the observation that is this landmark's.
+  // Only the part of the observation that is this landmark's: as far to either side as from where it was
+  // begun, and on to the branch's end where that lies on its line. A bent branch goes on as another landmark.
   const double reach = 0.5 * config_.max_length_m;
-  const double a = std::clamp(s + sign * observation.start_s_m, -reach, reach);
-  const double b = std::clamp(s + sign * observation.end_s_m, -reach, reach);
+  const Extent known = ExtentOf(*state, config_);
+  const double on_line = std::max(kOnLineM, 0.5 * observation.cylinder.radius());
+  const auto within = [&](double end) {
+    const double place = s + sign * end;
+    if (std::abs(place) <= reach) return place;
+    const Eigen::Vector3d d = in_map.point + end * in_map.axis - state->line.point;
+    if ((d - d.dot(state->line.axis) * state->line.axis).norm() > on_line) {
+      return std::clamp(place, -reach, reach);
+    }
+    return std::clamp(place, std::min(-reach, known.end - config_.max_length_m),
+                      std::max(reach, known.begin + config_.max_length_m));
+  };
+  const double a = within(observation.start_s_m);
+  const double b = within(observation.end_s_m);
 
   RadiusProfile::Observation o;
   o.s_start_m = std::min(a, b);

@@ -418,6 +418,25 @@ TEST_F(Degenerate, StripOfATrunk) {
   }
 }
 
+// A wall close behind mixes with the limb of a trunk but does not hide it.
+TEST(CylinderFitter, TrunkBeforeAWall) {
+  for (const double radius : {0.1, 0.2, 0.3}) {
+    double squares = 0.0;
+    constexpr int kTrials = 10;
+    for (unsigned seed = 1; seed <= kTrials; ++seed) {
+      TestSensor sensor;
+      sensor.azimuth_offset_deg = 0.0637 * seed;
+      const TestScan test = SimulateCones({Upright(5.0, 0.0, radius), Upright(8.4, 0.0, 3.0, 3.0)}, sensor, seed);
+      const FittedCylinder fit = CylinderFitter().FitSegment(test.scan, SegmentOf(test, 0));
+      ASSERT_EQ(fit.status, FitStatus::kMeasured) << radius << " " << ToString(fit.reason);
+      const double error = fit.cylinder.radius() - radius;
+      EXPECT_LT(std::abs(error), 3.5 * fit.radius_sigma_m());
+      squares += error * error;
+    }
+    EXPECT_LT(std::sqrt(squares / kTrials), 0.1 * radius);
+  }
+}
+
 TEST_F(Degenerate, Sphere) {
   std::mt19937 rng(3);
   std::normal_distribution<double> gauss(0.0, 0.01);
