@@ -1,6 +1,8 @@
 #include "dendro_slam/factor_graph/scan_summary.h"
 
 #include <memory>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "dendro_slam/factor_graph/between_factor.h"
@@ -48,7 +50,10 @@ ScanSummary SummarizeScans(Key from,
   SolverConfig config;
   config.relative_tolerance = kTolerance;
   IncrementalSolver solver(config);
-  solver.OptimizeBatch(all, start);
+  if (!solver.OptimizeBatch(all, start).converged) {
+    throw std::runtime_error("the scans from " + KeyName(from) + " to " + KeyName(to) +
+                             " do not come to agree; keep them as poses of their own");
+  }
 
   const Eigen::MatrixXd covariance = solver.JointMarginalCovariance(kept);
   ScanSummary summary;

@@ -23,8 +23,7 @@ constexpr double kNoInformation = 1e-12;
 }  // namespace
 
 // What variables leave on their neighbours: a linear factor, or none without neighbours.
-// @param removed_factors  In: factors that are to go without leaving anything; out: also all those
-// of
+// @param removed_factors  In: factors that are to go without leaving anything; out: also all those of
 //                         the variables.
 FactorList IncrementalSolver::Impl::Absorb(const std::vector<Key>& keys,
                                            std::vector<FactorId>* removed_factors) {

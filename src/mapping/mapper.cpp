@@ -598,7 +598,8 @@ void Mapper::Impl::AddKeyFrame(const MapperInput& input,
     const bool is_new = id < 0;
     if (is_new) {
       if (InsideALandmark(cylinders[i], h.T_kf_lidar)) continue;
-      if (OnALandmarkOutOfReach(cylinders[i], h.T_kf_lidar)) continue;
+      // At first the whole map was looked for.
+      if (!first && OnALandmarkOutOfReach(cylinders[i], h.T_kf_lidar)) continue;
       id = map.Add(cylinders[i], T_map_lidar, scan_number);
       started.push_back(id);
       values.Insert(LandmarkKey(id), Value(map.State(id).line));

@@ -222,13 +222,13 @@ PipelineResult Pipeline::Process(const LidarScan& scan) {
   timer_.Add("cylinder_fitting", stage.Lap());
   const std::optional<GroundPlane> ground = FitGroundPlane(result.scan);
   timer_.Add("ground_plane", stage.Lap());
-  result.icp = icp_.AddScan(result.scan, std::nullopt);
+  if (config_.tree_mapping.use_icp) result.icp = icp_.AddScan(result.scan, std::nullopt);
   timer_.Add("icp", stage.Lap());
 
   MapperInput input;
   input.stamp_ns = scan.stamp_ns;
   input.cylinders = result.cylinders;
-  if (config_.tree_mapping.use_icp) input.icp = result.icp;
+  input.icp = result.icp;
   const auto T_odom_base = mapping_poses_.Lookup(scan.stamp_ns);
   if (T_odom_base && config_.tree_mapping.use_odometry) {
     input.T_odom_lidar = *T_odom_base * T_base_lidar_;

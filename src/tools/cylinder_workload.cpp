@@ -249,6 +249,9 @@ int main(int argc, char** argv) {
   config.wildfire_threshold = config.still_threshold = wildfire;
 
   try {
+    if (options.between == "summarize" && options.landmarks != "cylinders") {
+      throw std::invalid_argument("--between summarize makes cylinder factors: it needs --landmarks cylinders");
+    }
     const Run run = Simulate(options);
     if (!options.write.empty()) Write(run, options.write);
     const double memory_before_mb = dendro::measure::PeakMemoryMb();

@@ -195,6 +195,23 @@ TEST(TreeMap, AGapSplitsAndADuplicateMerges) {
   EXPECT_EQ(twins.State(first).num_scans, 20);
 }
 
+// Begun at its foot and then seen up to its tip, 1.45 m from there. What goes on at an angle is another piece.
+TEST(TreeMap, AStraightBranchIsFollowedToItsTipAndABentOneIsNot) {
+  const Eigen::Isometry3d I = Eigen::Isometry3d::Identity();
+  const auto top = [&](const FittedCylinder& later) {
+    TreeMap map(TreeMapConfig{}, RadiusProfileConfig{});
+    const int id = map.Add(Fit({3, 0, 0}, {0, 0, 1}, 0.3, 0.1), I, 1);
+    for (int i = 2; i < 40; ++i) map.Observe(id, later, I, i);
+    const Landmark l = map.Landmarks(true).front();
+    EXPECT_LE(l.s_max_m - l.s_min_m, TreeMapConfig{}.max_length_m + 0.1);
+    return l.PointAt(l.s_max_m).z();
+  };
+  EXPECT_NEAR(top(Fit({3, 0, 0.7}, {0, 0, 1}, 0.75, 0.1)), 1.45, 0.06);
+  EXPECT_NEAR(top(Fit({3, 0, 1.5}, {0, 0, 1}, 1.5, 0.1)), 2.0, 0.12);  // No longer than it may be.
+  const double angle = 12.0 * M_PI / 180.0;
+  EXPECT_NEAR(top(Fit({3, 0, 0.7}, {std::sin(angle), 0, std::cos(angle)}, 0.75, 0.1)), 1.0, 0.06);
+}
+
 TEST(TreeMap, ATwigIsConfirmedByMillimetresAndWoodOfUnknownThicknessIsNot) {
   TreeMap map(TreeMapConfig{}, RadiusProfileConfig{});
   const Eigen::Isometry3d I = Eigen::Isometry3d::Identity();

@@ -282,6 +282,58 @@ TEST(Mapper, WhatIsNotLookedForIsNotBegunASecondTime) {
   EXPECT_GE(confirmed, world.branches().size() - 1);
 }
 
+// A post that one key frame saw whole and another one in two pieces, and now and then a scan between key
+// frames, so that it stays a candidate: when the second of them goes, so would all that holds the post.
+TEST(Mapper, AKeyFrameThatSawACandidateTwiceStaysForIt) {
+  World world(ThesisLikeTree(), 23);
+  MapperConfig config;
+  config.key_frame_window = 20;
+  Mapper mapper(config);
+  DriftingOdometry odometry(&world);
+  const auto post = [](const Eigen::Isometry3d& T_map_lidar, double low, double high) {
+    FittedCylinder fit;
+    fit.status = FitStatus::kMeasured;
+    fit.cylinder = TransformCylinder(
+        T_map_lidar.inverse(), Cylinder{Eigen::Vector3d::UnitZ(), {1.2, 1.2, 2.0 + 0.5 * (low + high)}, 1.0 / 0.03});
+    Vector5d sigma;
+    sigma << 0.02, 0.02, 0.01, 0.01, 0.1 / 0.03;
+    fit.covariance = sigma.cwiseAbs2().asDiagonal();
+    fit.start_s_m = -0.5 * (high - low);
+    fit.end_s_m = 0.5 * (high - low);
+    fit.num_points = 40;
+    fit.num_rings = 4;
+    fit.distance_m = 3.0;
+    fit.visible_arc_rad = 1.0;
+    return fit;
+  };
+  constexpr int kLap = 252, kShown = 8 * kLap;
+  int with_post = 0;  // Key frames.
+  int last_seen = 0;
+  for (int i = 0; i < 11 * kLap; ++i) {
+    const Eigen::Isometry3d T = CirclePose(0.1 * i, 4.0, 1.0, 2.0, 0.0);
+    MapperInput input;
+    input.stamp_ns = 100000000LL * (i + 1);
+    input.cylinders = world.Scan(T);
+    const std::size_t own = input.cylinders.size();
+    if (i >= kShown && with_post == 0) input.cylinders.push_back(post(T, -0.6, 0.6));
+    if (i >= kShown && with_post == 1) {
+      input.cylinders.push_back(post(T, -0.6, -0.1));
+      input.cylinders.push_back(post(T, 0.1, 0.6));
+    }
+    if (with_post == 2 && i == last_seen + 201) {
+      input.cylinders.push_back(post(T, -0.6, 0.6));
+    }
+    for (std::size_t k = own; k < input.cylinders.size(); ++k) input.cylinders[k].segment_id = 100 + static_cast<int>(k);
+    input.T_odom_lidar = odometry.Next(T);
+    const MapperResult result = mapper.AddScan(input);
+    if (input.cylinders.size() > own) {
+      last_seen = i;
+      if (with_post < 2 && result.is_key_frame) ++with_post;
+    }
+  }
+  EXPECT_EQ(with_post, 2);
+}
+
 TEST(Mapper, LapsLeaveMemoryWhereItWas) {
   // The circle's height is the border of two of the cubes in which key frames are looked up.
   World world(ThesisLikeTree(), 19);

@@ -31,8 +31,7 @@ struct PoseGraph {
 };
 
 /// Reads a graph. In a file of edges alone all vertices start at the identity; FIX is read over.
-/// @throws std::runtime_error naming the line, the vertex or edge and what to do, for a tag that is
-/// no
+/// @throws std::runtime_error naming the line, the vertex or edge and what to do, for a tag that is no
 ///         SE(3) vertex or edge, a missing or non-finite number, a zero quaternion, or an
 ///         information matrix that is not positive definite; UnknownVariableError for an edge to a
 ///         vertex that is missing among those given.

@@ -23,8 +23,8 @@ struct ScanSummary {
 /// frame relative to `to`: of all Gaussians in which these are independent, the one closest (in
 /// Kullback-Leibler divergence) to the joint marginal, because as many residuals as dimensions are
 /// recovered (Mazuran, Burgard, Tipaldi, "Nonlinear Factor Recovery for Long-Term SLAM", IJRR 2016,
-/// section 5). Curvatures lose nothing; what is lost is that all landmarks of a scan share the
-/// error of its motion. IncrementalSolver::Marginalize keeps that too, as one dense factor over all
+/// section 5). Curvatures that were measured independently of their lines lose nothing; what is lost is
+/// that all landmarks of a scan share the error of its motion. IncrementalSolver::Marginalize keeps that too, as one dense factor over all
 /// landmarks of the key frame, whose cost in every later step is the square of their number.
 ///
 /// @param from, to  Older and newer key frame.
@@ -34,9 +34,8 @@ struct ScanSummary {
 /// @param poses     Estimates of `from`, `to` and the scans between in one frame, whichever.
 /// @param kernel    Of the cylinder factors that come out; their covariances are those of the
 ///                  kernels' weights inside.
-/// @throws UnknownVariableError for a pose without an estimate or a landmark without a
-/// CylinderFactor;
-///         UnderconstrainedError where parts that are switched off, or a missing motion, leave a
+/// @throws UnknownVariableError for a pose without an estimate or a landmark without a CylinderFactor;
+///         std::runtime_error where the scans do not come to agree; UnderconstrainedError where parts that are switched off, or a missing motion, leave a
 ///         variable free.
 ScanSummary SummarizeScans(Key from,
                            Key to,

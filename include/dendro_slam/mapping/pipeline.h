@@ -172,7 +172,7 @@ struct PipelineResult {
   std::vector<FittedCylinder> cylinders;
   std::optional<RelativeMotion> icp;
   MapperResult mapping;
-  bool had_odometry = false;  ///< The odometry told the pose at the stamp.
+  bool had_odometry = false;  ///< The odometry told the pose at the stamp, and it was used.
 };
 
 /// The whole pipeline for one scan after the other, in the order of the nodelets and with their
