@@ -221,7 +221,7 @@ double RobustWeight(double ratio) {
 class SegmentFit {
  public:
   SegmentFit(const LabelledScan& scan, const Segment& segment, const CylinderFitterConfig& config)
-      : image_(scan.image), segment_(segment), config_(config) {}
+      : scan_(scan), image_(scan.image), segment_(segment), config_(config) {}
 
   FittedCylinder Fit();
   std::optional<Cylinder> Initial();
@@ -258,13 +258,15 @@ class SegmentFit {
   bool SeesASide(const BentCone& cone) const;
   void Report(const Estimate& estimate, FittedCylinder* out) const;
 
+  const LabelledScan& scan_;
   const RangeImage& image_;
   const Segment& segment_;
   const CylinderFitterConfig& config_;
   std::vector<Beam> beams_;
   std::vector<Edge> edges_;
-  std::vector<Edge> backed_edges_;  // The same before a surface so close that both mix.
-  std::vector<Edge> hidden_edges_;  // Where the segment ends and this surface or a nearer one goes on.
+  std::vector<Edge> backed_edges_;  // The same before a wall or a hedge so close that both mix.
+  std::vector<Edge> hidden_edges_;  // Where the segment ends and this surface, other wood close behind it or
+                                    // something nearer goes on.
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();  // Mean optical centre.
   Eigen::Vector3d centroid_ = Eigen::Vector3d::Zero();
   double bright_ = 0.0;  // Intensity of a full hit.
@@ -359,7 +361,9 @@ void SegmentFit::TryEdge(std::size_t pixel, int row, int col, int d_row, int d_c
         static_cast<double>((image_.point[next] - image_.beam_origin[next]).norm());
     // A nearer surface hides the silhouette; one close behind mixes with it.
     if (!(behind > range + std::max(config_.echo_separation_m, 6.0 * config_.range_sigma_m))) {
-      (behind > range + 6.0 * config_.range_sigma_m ? backed_edges_ : hidden_edges_).push_back(edge);
+      const bool backed = behind > range + 6.0 * config_.range_sigma_m &&
+                          scan_.label.size() == image_.size() && !scan_.IsWood(next);
+      (backed ? backed_edges_ : hidden_edges_).push_back(edge);
       return;
     }
     const double brightness = image_.intensity.size() == image_.size()

@@ -47,8 +47,8 @@ void Cover(LandmarkState* state, double s_begin, double s_end, double cell) {
   for (int k = first; k <= last; ++k) ++state->coverage[static_cast<std::size_t>(k - state->first_cell)];
 }
 
-// What lies so far from a landmark's line, or half of its radius, is on it [m].
-constexpr double kOnLineM = 0.01;
+// What lies so far from a landmark's line is on it [m].
+constexpr double kOnLineM = 0.015;
 
 struct Extent {
   double begin = 0.0, end = 0.0;
@@ -396,12 +396,11 @@ void TreeMap::Observe(int id,
   // begun, and on to the branch's end where that lies on its line. A bent branch goes on as another landmark.
   const double reach = 0.5 * config_.max_length_m;
   const Extent known = ExtentOf(*state, config_);
-  const double on_line = std::max(kOnLineM, 0.5 * observation.cylinder.radius());
   const auto within = [&](double end) {
     const double place = s + sign * end;
     if (std::abs(place) <= reach) return place;
     const Eigen::Vector3d d = in_map.point + end * in_map.axis - state->line.point;
-    if ((d - d.dot(state->line.axis) * state->line.axis).norm() > on_line) {
+    if ((d - d.dot(state->line.axis) * state->line.axis).norm() > kOnLineM) {
       return std::clamp(place, -reach, reach);
     }
     return std::clamp(place, std::min(-reach, known.end - config_.max_length_m),
