@@ -137,7 +137,7 @@ def tree_figure(map_dir, tree):
     title = f"{tree_title(tree).capitalize()}: {len(branches)} branches" if tree is not None else \
         f"{len(branches)} pieces not attached to a tree"
     fig.suptitle(title, y=0.995, fontsize=12)
-    note = "branch id: order, diameter at the base, length. Pale: inferred between measurements."
+    note = "branch id: order, diameter of its lowest measured section, length. Pale: inferred between measurements."
     if len(order) > MAX_LEGEND:
         note += f" {len(order) - MAX_LEGEND} more in branches.csv."
     share = legend_height / (fig_height + legend_height)
