@@ -142,6 +142,7 @@ PoseGraph ReadG2o(std::istream& in) {
 }
 
 std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph) {
+  if (graph.poses.empty()) throw std::invalid_argument("pose graph: no poses; add at least one");
   std::map<std::int64_t, std::vector<std::int64_t>> neighbours;
   for (const PoseGraphEdge& edge : graph.edges) {
     neighbours[edge.from].push_back(edge.to);

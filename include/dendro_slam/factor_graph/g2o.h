@@ -39,7 +39,8 @@ PoseGraph ReadG2o(std::istream& in);
 
 /// The order in which poses can be added one by one, every one but the first with an edge to one
 /// before it: ascending ids, a pose that no edge joins to a lower one as soon as it can be.
-/// @throws UnderconstrainedError naming a pose that is not connected to the first.
+/// @throws UnderconstrainedError naming a pose that is not connected to the first; std::invalid_argument
+///         without poses.
 std::vector<std::int64_t> InsertionOrder(const PoseGraph& graph);
 
 /// Writes a graph with all digits.
@@ -55,7 +56,7 @@ FactorList PoseGraphFactors(const PoseGraph& graph);
 /// linear relaxation `R_j = R_i R_ij`, projected onto SO(3), then translations by linear least
 /// squares. The first pose keeps its value. It does not end in the local minima that an odometry
 /// chain on a sphere or torus leads to.
-/// @throws UnderconstrainedError naming a pose that is not connected to the first.
+/// @throws as InsertionOrder does.
 std::map<std::int64_t, Eigen::Isometry3d> ChordalInitialization(const PoseGraph& graph);
 
 }  // namespace dendro

@@ -87,7 +87,8 @@ struct UpdateResult {
 /// al., "iSAM2", IJRR 2012; Davis, "Direct Methods for Sparse Linear Systems"). Owns the factors'
 /// linearisations and the estimate; shares the factors. Deterministic; no state outside the object.
 ///
-/// A call that throws leaves the graph and the estimate as they were.
+/// A call that throws leaves the graph and the estimate as they were, but for two: Update with `converge`
+/// keeps its change when a later iteration throws, OptimizeBatch the estimates of steps it had accepted.
 class IncrementalSolver {
  public:
   explicit IncrementalSolver(const SolverConfig& config = {});

@@ -186,7 +186,7 @@ class Mapper {
   std::vector<Landmark> AllLandmarks() const;
   /// Poses of all scans with the graph's present estimate.
   std::vector<StampedPose> Trajectory() const;
-  /// At most so many of them: every one, or every second, fourth, ... from the first on, and the last.
+  /// At most so many of them (3 where fewer are asked for): every one, or every second, fourth, ... from the first on, and the last.
   /// The same poses are in it until their number doubles.
   std::vector<StampedPose> ThinnedTrajectory(std::size_t most) const;
   /// Correction of the odometry at the last scan that had odometry; identity before.
