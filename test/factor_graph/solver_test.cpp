@@ -538,6 +538,7 @@ TEST(G2o, InsertionOrderFollowsIdsAndEdges) {
     graph.poses.emplace(b, Eigen::Isometry3d::Identity());
   }
   EXPECT_THAT(InsertionOrder(graph), testing::ElementsAre(0, 1, 3, 4, 2));
+  EXPECT_THROW(InsertionOrder(PoseGraph{}), std::invalid_argument);
 }
 
 }  // namespace
