@@ -30,6 +30,8 @@ import time
 
 import numpy as np
 import torch
+import torch.distributed
+import torch.multiprocessing
 import torch.nn as nn
 import torch.nn.functional as F
 
@@ -37,10 +39,11 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 PROGRAMS = pathlib.Path(os.environ.get("DENDRO_BUILD_DIR", ROOT / "build")) / "devel/lib/dendro_slam"
 CLASSES = ["ground", "wood", "leaf", "other"]
 WOOD, OTHER = 1, 3
-INPUT = "dendro_range_planes_3"
-PLANES = 14
+INPUT = "dendro_range_planes_4"
+PLANES = 21
 (MASK, RANGE, INTENSITY, HEIGHT, UP, LATERAL, VERTICAL, RISE, SIDE,
- WIDTH, BRIGHTNESS, BULGE, SLANT, ROUGHNESS) = range(PLANES)
+ WIDTH, BRIGHTNESS, BULGE, SLANT, ROUGHNESS,
+ LINE_SUPPORT, LINE_ROWS, LINE_BEND, LINE_DEPTH, LINE_SLOPE, LINE_LIKENESS, LINE_ELSEWHERE) = range(PLANES)
 IGNORE = 255
 
 LAYERS = ("stem:16:3x5:1x2 push "
@@ -186,7 +189,7 @@ def fold(name, conv, bn, out_axis=0):
 
 
 class ErfNet(nn.Module):
-    def __init__(self, layers, planes=PLANES, dropout=0.03):
+    def __init__(self, layers, planes=PLANES, dropout=0.0):
         super().__init__()
         self.spec = layers
         self.words = layers.split()
@@ -423,19 +426,22 @@ def head_down(x, y):
         x[plane, :-1] = np.where(both, sign * step[1:], missing)
         x[plane, -1] = missing
         x[plane][~mask] = 0.0
+    x[LINE_DEPTH] *= -1.0
+    x[LINE_SLOPE] *= -1.0
     return x, y
 
 
 def augment(x, y, rng):
     """Yaw comes from the crop's place; here mirror, head down, range scale, drop-out, intensity, ground.
 
-    The planes of the runs stay as they are where a return is dropped: they would seldom change much.
+    The planes of the runs and lines stay as they are where a return is dropped: they would seldom change much.
     """
     mask = x[MASK] > 0.5
     if rng.random() < 0.5:
         x, y, mask = x[:, :, ::-1].copy(), y[:, ::-1].copy(), mask[:, ::-1].copy()
         # The step to the next column becomes the step from it.
         x[SIDE] *= -1.0
+        x[LINE_SLOPE] *= -1.0
         step = x[LATERAL].copy()
         x[LATERAL, :, :-1] = np.where(mask[:, 1:], -step[:, 1:], 1.0)
         x[LATERAL, :, :-1][~mask[:, :-1]] = 0.0
@@ -635,16 +641,69 @@ def freeze_encoder(net, frozen):
             module.eval()
 
 
+class Team:
+    """Processes that train the same network side by side: each has a batch of its own, the gradients are averaged.
+
+    On a CPU two processes of one thread each do nearly twice the work of one; two threads of one process do not, since
+    the tensors of this network are small. The batch normalisations see the batch of their own process.
+    """
+
+    def __init__(self, rank, size, meeting):
+        self.rank, self.size = rank, size
+        if size > 1:
+            torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=size)
+
+    def average(self, parameters, rate):
+        """Averages the gradients in place; returns the learning rate of the first process."""
+        if self.size == 1:
+            return rate
+        parts = [p.grad for p in parameters if p.grad is not None]
+        flat = torch.cat([g.reshape(-1).float() for g in parts]
+                         + [torch.tensor([float(rate) * self.size if self.rank == 0 else 0.0])])
+        torch.distributed.all_reduce(flat)
+        flat /= self.size
+        at = 0
+        for grad in parts:
+            grad.copy_(flat[at:at + grad.numel()].view_as(grad))
+            at += grad.numel()
+        return float(flat[-1])
+
+    def agree(self, yes):
+        """What the first process says."""
+        if self.size == 1:
+            return yes
+        answer = torch.tensor([float(yes)])
+        torch.distributed.broadcast(answer, 0)
+        return bool(answer.item())
+
+
 def train(args):
-    torch.set_num_threads(args.threads)
+    if args.processes == 1:
+        train_member(0, args, None)
+        return
+    meeting = (args.data / f"processes_{os.getpid()}").resolve()
+    try:
+        torch.multiprocessing.spawn(train_member, (args, meeting), args.processes)
+    finally:
+        meeting.unlink(missing_ok=True)
+
+
+def train_member(rank, args, meeting):
+    torch.set_num_threads(max(1, args.threads // args.processes))
     torch.manual_seed(args.seed)
+    team = Team(rank, args.processes, meeting)
+
+    def say(text):
+        if rank == 0:
+            print(text, flush=True)
+
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     args.device = "a GPU" if device.type == "cuda" else f"{args.threads} CPU core(s)"
     training, held_out = Dataset(finished(args.data, "train_*")), Dataset(finished(args.data, "held_out"))
     net = ErfNet(args.layers).to(device, memory_format=torch.channels_last)
     if args.bfloat16 is None:
-        args.bfloat16 = bfloat16_is_faster(args, device)
-    print(f"training on {device.type} in {'bfloat16' if args.bfloat16 else 'float32'}", flush=True)
+        args.bfloat16 = team.agree(bfloat16_is_faster(args, device))
+    say(f"training on {device.type} in {'bfloat16' if args.bfloat16 else 'float32'}")
     phases = [("encoder", 0 if args.init else args.encoder_epochs),
               ("decoder", 0 if args.init else args.decoder_epochs), ("joint", args.joint_epochs)]
     total = sum(n for _, n in phases)
@@ -657,7 +716,7 @@ def train(args):
             raise SystemExit("train_segmentation: the checkpoint is of another architecture")
         state = saved["state"]
         net.load_state_dict(saved["net"])
-        print(f"resumed after epoch {state['epoch']} of {total}, best {state['best']:.4f}", flush=True)
+        say(f"resumed after epoch {state['epoch']} of {total}, best {state['best']:.4f}")
     else:
         saved = None
         if args.init:
@@ -666,7 +725,7 @@ def train(args):
             unfold(net, [x for x, _ in batches(training, rng, 30, args.batch, args.width)])
             net = net.to(device, memory_format=torch.channels_last)
     picture = list(range(0, held_out.count, max(1, held_out.count // args.held_out_scans)))
-    while state["epoch"] < total and state["stale"] < args.patience:
+    while state["epoch"] < total:
         epoch = state["epoch"]
         begin = 0
         for phase, length in phases:
@@ -683,8 +742,8 @@ def train(args):
                 average.state, average.steps = saved["average"], saved["average_steps"]
             saved = None
         # Data and drop-out of an epoch depend on the seed and its number only: resuming is exact.
-        rng = np.random.default_rng([args.seed, epoch])
-        torch.manual_seed(args.seed * 10007 + epoch)
+        rng = np.random.default_rng([args.seed, epoch] + ([rank] if rank else []))
+        torch.manual_seed(args.seed * 10007 + epoch + 1000003 * rank)
         peak = {"encoder": 2e-3, "decoder": 2e-3, "joint": args.joint_rate}[phase]
         net.train()
         freeze_encoder(net, phase == "decoder")
@@ -704,8 +763,6 @@ def train(args):
                 budget = 60.0 * args.minutes - state["joint_from"]
                 progress = max(progress, min(1.0, (used - state["joint_from"]) / budget))
             rate = peak * warm * (0.5 + 0.5 * np.cos(np.pi * progress)) + 1e-5
-            for group in optimizer.param_groups:
-                group["lr"] = rate
             x, y = x.to(device, memory_format=torch.channels_last), y.to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=args.bfloat16):
                 logits = net.coarse(x) if phase == "encoder" else net(x)
@@ -713,16 +770,21 @@ def train(args):
             loss = coarse_loss(logits, y) if phase == "encoder" else fine_loss(logits, y, x)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
+            rate = team.average(parameters, rate)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
             nn.utils.clip_grad_norm_(net.parameters(), 5.0)
             optimizer.step()
-            average.update(net)
+            if rank == 0:
+                average.update(net)
             losses.append(float(loss.detach()))
         state["seconds"] += time.time() - started
         state["epoch"] += 1
         line = {"epoch": state["epoch"], "phase": phase, "loss": round(float(np.mean(losses)), 4),
                 "minutes": round(state["seconds"] / 60, 1)}
-        if phase != "encoder" and (state["epoch"] % args.score_every == 0 or state["epoch"] == total
-                                   or (args.minutes and state["seconds"] > 60 * args.minutes)):
+        out_of_time = team.agree(args.minutes and state["seconds"] > 60 * args.minutes)
+        if rank == 0 and phase != "encoder" and (state["epoch"] % args.score_every == 0
+                                                 or state["epoch"] == total or out_of_time):
             smooth = ErfNet(args.layers).to(device)
             smooth.load_state_dict(average.state)
             line.update(evaluate(smooth, held_out, picture)["all"])
@@ -734,19 +796,27 @@ def train(args):
             elif phase == "joint":
                 state["stale"] += 1
         state["log"].append(line)
-        print(f"[{state['epoch']}/{total}] " + " ".join(f"{k}={v}" for k, v in line.items()
-                                                        if k != "epoch"), flush=True)
+        say(f"[{state['epoch']}/{total}] " + " ".join(f"{k}={v}" for k, v in line.items() if k != "epoch"))
         ended = state["epoch"] == begin + length
         if ended and phase == "encoder":
+            # The other processes carry on from the average of the first.
             net.load_state_dict(average.state)
-        temporary = checkpoint.with_suffix(".tmp")
-        torch.save({"layers": args.layers, "net": net.state_dict(), "state": state,
-                    "optimizer": optimizer.state_dict(), "average": average.state,
-                    "average_steps": average.steps}, temporary)
-        os.replace(temporary, checkpoint)
-        if args.minutes and state["seconds"] > 60 * args.minutes:
-            print("the time is used up", flush=True)
+            if team.size > 1:
+                for value in net.state_dict().values():
+                    torch.distributed.broadcast(value, 0)
+        if rank == 0:
+            temporary = checkpoint.with_suffix(".tmp")
+            torch.save({"layers": args.layers, "net": net.state_dict(), "state": state,
+                        "optimizer": optimizer.state_dict(), "average": average.state,
+                        "average_steps": average.steps}, temporary)
+            os.replace(temporary, checkpoint)
+        if out_of_time:
+            say("the time is used up")
             break
+        if not team.agree(state["stale"] < args.patience):
+            break
+    if rank != 0:
+        return
     best = ErfNet(args.layers)
     best.load_state_dict(state["best_state"])
     best.eval()
@@ -782,7 +852,7 @@ Wood, ground, leaf and other in a range image. Written by `scripts/train_segment
 - Input: {PLANES} planes, see `include/dendro_slam/segmentation/network_input.h`
 - Data: simulated only, {training.count} scans to train (scene seeds from {training.seeds[0]}), {held_out.count}
   held out (scene seeds from {held_out.seeds[0]}, other scenes), {training.rows} x {training.cols}, by `simulate_training_scans`
-- Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.batch} crops
+- Training: {', '.join(f'{n} epochs {p}' for p, n in phases.items())}, {args.steps} steps of {args.processes} x {args.batch} crops
   {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
   {'bfloat16' if args.bfloat16 else 'float32'}, {state['seconds'] / 60:.0f} min on {args.device}
 - Started from: {args.init or 'random numbers'}
@@ -871,6 +941,8 @@ def main():
     parser.add_argument("--bfloat16", action=argparse.BooleanOptionalAction, default=None,
                         help="default: if it is faster on this CPU")
     parser.add_argument("--threads", type=int, default=max(1, os.cpu_count() or 1))
+    parser.add_argument("--processes", type=int, help="that train side by side, each with a batch and its share of the "
+                        "threads; default: one a thread without a GPU")
     parser.add_argument("--init", type=pathlib.Path, metavar="FILE",
                         help="go on from these weights in the joint step, with a new learning rate; "
                              "blocks nb they lack begin as ones that do nothing")
@@ -886,6 +958,7 @@ def main():
     args.data = args.data or ROOT / f"output/segmentation_data{suffix}"
     args.output = args.output or ROOT / f"config/models/erfnet_wood{suffix}.safetensors"
     args.layers = args.layers or (LAYERS if native else LAYERS_32X360)
+    args.processes = args.processes or (1 if torch.cuda.is_available() else args.threads)
     args.projector = [] if native else ["--model", "uniform", "--rows", "32", "--cols", "360"]
     if args.fixture:
         write_fixture(args.fixture)

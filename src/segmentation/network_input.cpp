@@ -3,14 +3,27 @@
 #include <algorithm>
 #include <cmath>
 
+#include "dendro_slam/segmentation/line_support.h"
+
 namespace dendro {
 namespace {
 
 constexpr double kPi = 3.14159265358979323846;
 
+constexpr std::size_t kFirstLinePlane = 14;
+constexpr float kBareGround = 0.12F;  // Nearer than this to the ground plane no line is looked for [m].
+
 float Squash(float step, float scale) { return step / (std::abs(step) + scale); }
 
 float Horizontal(const Eigen::Vector3f& p) { return std::hypot(p.x(), p.y()); }
+
+// Mean angle between neighbouring rows.
+float RowGap(const RangeImage& image) {
+  if (image.rows < 2 || image.cols < 1) return 0.0F;
+  const float cosine = image.beam_direction[image.Index(0, 0)].dot(
+      image.beam_direction[image.Index(image.rows - 1, 0)]);
+  return std::acos(std::clamp(cosine, -1.0F, 1.0F)) / static_cast<float>(image.rows - 1);
+}
 
 // Neighbouring returns of a row that lie on one surface, and what the planes say of them.
 struct Run {
@@ -114,10 +127,24 @@ std::vector<float> NetworkInput(const RangeImage& image,
   const std::size_t plane = static_cast<std::size_t>(image.rows) * width;
   std::vector<float> planes(kNetworkInputChannels * plane, 0.0F);
   const auto has = [&](std::size_t i) { return image.HasReturn(i) && image.range[i] > 0.0F; };
+  LineSupportInput lines;
+  lines.rows = image.rows;
+  lines.cols = image.cols;
+  lines.row_gap_rad = RowGap(image);
+  lines.range.assign(image.size(), 0.0F);
+  lines.log_width.assign(image.size(), 0.0F);
+  lines.wanted.assign(image.size(), 0);
   std::vector<Run> runs;
   std::vector<int> run_of;
   for (int row = 0; row < image.rows; ++row) {
     FindRuns(image, row, &runs, &run_of);
+    for (int col = 0; col < image.cols; ++col) {
+      const std::size_t pixel = image.Index(row, col);
+      if (!has(pixel)) continue;
+      lines.range[pixel] = image.range[pixel];
+      lines.log_width[pixel] =
+          4.0F * runs[static_cast<std::size_t>(run_of[static_cast<std::size_t>(col)])].width;
+    }
     for (std::size_t c = 0; c < width; ++c) {
       if (columns[c] < 0) continue;
       const std::size_t pixel = image.Index(row, columns[c]);
@@ -154,6 +181,17 @@ std::vector<float> NetworkInput(const RangeImage& image,
       out[11 * plane] = run.bulge;
       out[12 * plane] = run.slant;
       out[13 * plane] = run.roughness;
+      lines.wanted[pixel] = !ground || std::abs(ground->Height(p)) >= kBareGround;
+    }
+  }
+  const std::vector<float> support = LineSupport(lines);
+  for (std::size_t k = 0; k < kLineSupportPlanes; ++k) {
+    for (int row = 0; row < image.rows; ++row) {
+      const float* from = support.data() + k * image.size() + image.Index(row, 0);
+      float* to = planes.data() + (kFirstLinePlane + k) * plane + static_cast<std::size_t>(row) * width;
+      for (std::size_t c = 0; c < width; ++c) {
+        if (columns[c] >= 0) to[c] = from[columns[c]];
+      }
     }
   }
   return planes;

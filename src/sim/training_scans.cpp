@@ -43,10 +43,11 @@ class Random {
 void AddTrees(const std::string& kind, Random& rng, Scene* scene) {
   const bool thesis = kind == "thesis";
   const bool orchard = kind == "orchard";
-  const bool leafy = kind == "leafy" || (orchard && rng.Chance(0.7));
+  const bool distant = kind == "distant";
+  const bool leafy = kind == "leafy" || (orchard && rng.Chance(0.7)) || (distant && rng.Chance(0.6));
   const int wanted = thesis ? rng.Integer(1, 2) : orchard ? rng.Integer(4, 8) : rng.Integer(1, 5);
   const double spacing = rng.Uniform(2.0, 4.5);
-  const double area = thesis ? 5.0 : rng.Uniform(5.0, 12.0);
+  const double area = thesis ? 5.0 : distant ? rng.Uniform(8.0, 24.0) : rng.Uniform(5.0, 12.0);
   std::vector<Eigen::Vector2d> places;
   for (int attempt = 0; attempt < 50 && static_cast<int>(places.size()) < wanted; ++attempt) {
     Eigen::Vector2d place(rng.Uniform(-area / 2, area / 2), rng.Uniform(-area / 2, area / 2));
@@ -177,8 +178,8 @@ void AddObstacles(const std::string& kind, Random& rng, Scene* scene) {
 }  // namespace
 
 const std::vector<std::string>& TrainingKinds() {
-  static const std::vector<std::string> kinds = {"thesis", "leafless", "leafy",
-                                                 "tilted", "clutter",  "orchard"};
+  static const std::vector<std::string> kinds = {"thesis",  "leafless", "leafy",  "tilted",
+                                                 "clutter", "orchard",  "distant"};
   return kinds;
 }
 
@@ -282,7 +283,9 @@ std::vector<TrainingScan> SimulateTrainingScans(const std::string& kind,
     for (int attempt = 0; attempt < 40; ++attempt) {
       const double angle = rng.Uniform(0.0, 2.0 * kPi);
       const double distance =
-          kind == "thesis" ? rng.Uniform(3.0, 8.0) : rng.Uniform(2.0, 12.0);
+          kind == "thesis"    ? rng.Uniform(3.0, 8.0)
+          : kind == "distant" ? rng.Uniform(8.0, 20.0)
+                              : rng.Uniform(2.0, 12.0);
       const double height =
           rng.Uniform(0.5, kind == "thesis" ? std::min(5.0, top) : std::min(8.0, top + 1.0));
       position = base + Eigen::Vector3d(distance * std::cos(angle), distance * std::sin(angle), 0);

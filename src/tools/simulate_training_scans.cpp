@@ -32,7 +32,7 @@ struct Options {
   int sub_rays_width = 8;
   int sub_rays_height = 3;
   std::string kinds =
-      "leafy,tilted,leafless,orchard,clutter,tilted,leafy,thesis,tilted,leafy,clutter,tilted";
+      "leafy,tilted,orchard,distant,clutter,leafless,leafy,tilted,orchard,distant,clutter,thesis";
   dendro::ProjectorConfig projector;
 };
 
@@ -111,7 +111,7 @@ int main(int argc, char** argv) {
   app.add_option("--seed", options.seed, "Of the first scene; the next ones count up");
   app.add_option("--sub-rays-width", options.sub_rays_width)->check(CLI::Range(1, 64));
   app.add_option("--sub-rays-height", options.sub_rays_height)->check(CLI::Range(1, 64));
-  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted, clutter, orchard)");
+  app.add_option("--kinds", options.kinds, "Kinds of scenes, in turn (thesis, leafless, leafy, tilted, clutter, orchard, distant)");
   app.add_option("--model", options.projector.model, "vlp16 or uniform");
   app.add_option("--rows", options.projector.rows);
   app.add_option("--cols", options.projector.cols);

@@ -9,9 +9,9 @@
 namespace dendro {
 
 /// Number of planes the network sees per pixel.
-inline constexpr int kNetworkInputChannels = 14;
+inline constexpr int kNetworkInputChannels = 21;
 /// Name of this set of planes in weights files and training data.
-inline constexpr const char* kNetworkInputVersion = "dendro_range_planes_3";
+inline constexpr const char* kNetworkInputVersion = "dendro_range_planes_4";
 
 /// Range, position and intensity of a scan as the network's input planes, each about in [-1, 1]:
 ///
@@ -40,6 +40,9 @@ inline constexpr const char* kNetworkInputVersion = "dendro_range_planes_3";
 /// 11 to 13 are 0 for runs over more than an eighth of the turn (ground and walls). A leaf is narrow,
 /// flat and slanting, wood is narrow and round or goes on: a look at the whole run tells them apart
 /// where the few columns of one convolution cannot.
+///
+///  14 to 20      whether a thin straight thing goes on in the rows above and below, see LineSupport(); 0
+///               for returns within 12 cm of the ground plane
 ///
 /// A step towards a missing pixel counts as infinitely far (+1, and for 7 as 0).
 ///
