@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <random>
 #include <vector>
 
 #include <Eigen/Dense>
@@ -148,6 +149,55 @@ TEST(LineSupport, StepInDepthIsNoLine) {
   scan.Run();
   EXPECT_LT(scan.At(kSupport, 8, 700), -1.0F);
   EXPECT_GT(scan.At(kSupport, 6, 700), 0.9F);
+}
+
+// What the training's mirrored and upside down scans rely on.
+TEST(LineSupport, MirroredAndUpsideDownOnlyTheSignsChange) {
+  constexpr int kRows = 9;
+  constexpr int kCols = 300;
+  Scan scan(kRows, kCols, 5.0 * 2.0 * M_PI / kCols);
+  Scan mirrored(kRows, kCols, 5.0 * 2.0 * M_PI / kCols);
+  Scan turned(kRows, kCols, 5.0 * 2.0 * M_PI / kCols);
+  std::mt19937 engine(11);
+  std::uniform_real_distribution<double> uniform(0.0, 1.0);
+  for (int row = 0; row < kRows; ++row) {
+    for (int col = 0; col < kCols; ++col) {
+      if (uniform(engine) < 0.3) continue;
+      const double range = 3.0 + 0.4 * uniform(engine);
+      const double width = -3.0 + 3.0 * uniform(engine);
+      scan.Put(row, col, range, width);
+      mirrored.Put(row, kCols - 1 - col, range, width);
+      turned.Put(kRows - 1 - row, col, range, width);
+    }
+  }
+  scan.Run();
+  mirrored.Run();
+  turned.Run();
+  int compared = 0;
+  for (int row = 0; row < kRows; ++row) {
+    for (int col = 0; col < kCols; ++col) {
+      const auto expect = [&](const Scan& other, int r, int c, int plane, float sign) {
+        // Slopes a column apart may find the same returns: the first of them is named.
+        const float slack = plane == kSlope ? 2.01F / 6.0F : 1e-4F;
+        ASSERT_NEAR(other.At(plane, r, c), sign * scan.At(plane, row, col), slack) << plane;
+      };
+      for (const int plane : {kSupport, kElsewhere}) {
+        expect(mirrored, row, kCols - 1 - col, plane, 1.0F);
+        expect(turned, kRows - 1 - row, col, plane, 1.0F);
+      }
+      if (scan.At(kOnLine, row, col) == 0.0F) continue;  // All slopes are as bad: any may be named.
+      ++compared;
+      for (const int plane : {kOnLine, kBend, kLikeness}) {
+        expect(mirrored, row, kCols - 1 - col, plane, 1.0F);
+        expect(turned, kRows - 1 - row, col, plane, 1.0F);
+      }
+      expect(mirrored, row, kCols - 1 - col, kSlope, -1.0F);
+      expect(mirrored, row, kCols - 1 - col, kDepth, 1.0F);
+      expect(turned, kRows - 1 - row, col, kSlope, -1.0F);
+      expect(turned, kRows - 1 - row, col, kDepth, -1.0F);
+    }
+  }
+  EXPECT_GT(compared, 1000);
 }
 
 TEST(LineSupport, OnlyWhereWantedAndFiniteForAnySize) {

@@ -28,8 +28,8 @@ struct Scores {
   double wood_iou, accuracy, recall;
 };
 
-// Scores over scans of scenes whose seeds were never trained on (training uses seeds below 900000,
-// its held-out set 900000 to 901000).
+// Scores over scans of scenes whose seeds were never trained on (training uses seeds below 5000000,
+// its held-out set among them).
 Scores ScoreOn(WoodSegmenter& segmenter,
                const std::string& kind,
                int scenes,
