@@ -46,14 +46,16 @@ PLANES = 21
  LINE_SUPPORT, LINE_ROWS, LINE_BEND, LINE_DEPTH, LINE_SLOPE, LINE_LIKENESS, LINE_ELSEWHERE) = range(PLANES)
 IGNORE = 255
 
+# Rows are few: the first halving is of columns only. Blocks are cheap where the image is small, so most are there.
 LAYERS = ("stem:16:3x5:1x2 push "
-          "down:32:2x2 nb:1x2 push "
-          "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "
+          "down:32:1x2 nb:1x1 push "
+          "down:64:2x2 nb:1x1 nb:1x2 push "
+          "down:96:2x2 nb:1x1 nb:1x2 nb:1x4 "
+          "grow:64:1x1:2x2 add "
           "grow:32:1x1:2x2 add conv:32:3x3 "
-          "grow:16:1x1:2x2 add conv:32:3x3 "
+          "grow:16:1x1:1x2 add conv:32:3x3 "
           "last:4:1x1:1x2")
-# A pixel of the thesis' image is a whole degree: no azimuth to spare for a stride in the input layer. Two
-# blocks more than above, which the small image leaves time for.
+# A pixel of the thesis' image is a whole degree: no azimuth to spare for a stride in the input layer.
 LAYERS_32X360 = ("stem:16:3x5:1x1 push "
                  "down:32:2x2 nb:1x1 nb:1x2 push "
                  "down:64:2x2 nb:1x1 nb:1x2 nb:1x4 nb:1x8 "

@@ -31,7 +31,7 @@ Padded Pad(const LineSupportInput& input, int margin) {
     for (int k = -margin; k < input.cols + margin; ++k) {
       const std::size_t col = static_cast<std::size_t>(((k % input.cols) + input.cols) % input.cols);
       const float value = input.range[row * cols + col];
-      if (!(value > 0.0F)) continue;
+      if (!(value > 0.0F && value < kNone)) continue;
       range[k + margin] = value;
       width[k + margin] = input.log_width[row * cols + col];
     }

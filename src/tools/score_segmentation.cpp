@@ -37,7 +37,7 @@ struct Options {
   std::string scene;  ///< Scene file; with `path` instead of random scenes.
   std::string path;
   int every = 10;     ///< Of the flight's scans.
-  std::string kinds = "thesis,leafless,leafy,orchard,tilted,clutter";
+  std::string kinds = "thesis,leafless,leafy,orchard,tilted,clutter,distant";
   int sub_rays_width = 8;
   int sub_rays_height = 3;
   dendro::ProjectorConfig projector;
