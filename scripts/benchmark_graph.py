@@ -325,7 +325,8 @@ def main():
         entry["ratio_p99"] = entry["own"]["p99_ms"] / min(p["p99_ms"] for p in peers)
         # Of a graph that is not among the public ones, what the batch solution reaches.
         best = DEFAULT_GRAPHS.get(path.name, entry["own_batch"]["half_chi2"])
-        entry["error_above_best"] = entry["own"]["half_chi2"] / best - 1.0
+        # A graph without noise has no error to compare.
+        entry["error_above_best"] = entry["own"]["half_chi2"] / best - 1.0 if best > 1e-9 else None
         entry["ratio_batch_iteration"] = entry["own_batch"]["iteration_s"] / entry["gtsam_batch"]["iteration_s"]
         report[path.name] = entry
         if not args.json:
@@ -346,7 +347,8 @@ def main():
         return
     print("ratios")
     for what, value, aim in summary_rows(report):
-        print(f"  {what:60s} {value:10.5f}" + (f"   aim: at most {aim:g}" if aim is not None else ""))
+        shown = "         -" if value is None else f"{value:10.5f}"
+        print(f"  {what:60s} {shown}" + (f"   aim: at most {aim:g}" if aim is not None else ""))
 
 
 if __name__ == "__main__":
