@@ -42,7 +42,7 @@ Padded Pad(const LineSupportInput& input, int margin) {
 using Lanes = std::array<float, kLanes>;
 
 struct Block {
-  Lanes best, support, rows, bend, depth, slope, likeness, sum;
+  Lanes best, rows, bend, depth, slope, likeness, sum;
 };
 
 // All slopes for kLanes pixels of a row; `range` and `width` point at the first of them in a padded image.
@@ -98,7 +98,8 @@ void TrySlopes(const float* range,
         low[i] = std::min(std::min(a, b), c);
       }
     }
-    Lanes depth, bend, score, rows, unlike, second;
+    Lanes depth, curve, bend, score, rows, unlike;
+    Lanes followed;  // Not 0 where a return in a neighbouring row gives the line a direction.
     for (std::size_t i = 0; i < kLanes; ++i) {
       const float limit = 2.0F * gap[i] + tolerance[i];
       const float up = std::abs(next[0][i] - R[i]) < limit ? 1.0F : 0.0F;
@@ -106,8 +107,8 @@ void TrySlopes(const float* range,
       const float both = up * down;
       const float one = up > 0.0F ? next[0][i] - R[i] : down > 0.0F ? R[i] - next[1][i] : 0.0F;
       const float s = both > 0.0F ? 0.5F * (next[0][i] - next[1][i]) : one;
-      const float curve = R[i] * angle + 2.0F * s * s / R[i];
-      const float t = both > 0.0F ? std::abs(next[0][i] + next[1][i] - 2.0F * R[i] - curve) : 0.0F;
+      curve[i] = R[i] * angle + 2.0F * s * s / R[i];
+      const float t = both > 0.0F ? std::abs(next[0][i] + next[1][i] - 2.0F * R[i] - curve[i]) : 0.0F;
       const float straight = t < 2.0F * tolerance[i] ? 1.0F : 0.0F;
       const float hit_up = up * straight;
       const float hit_down = down * straight;
@@ -115,14 +116,12 @@ void TrySlopes(const float* range,
       const float hidden_down = least[1][i] < R[i] - 3.0F * gap[i] ? 0.0F : -1.0F;
       depth[i] = s;
       bend[i] = t;
-      second[i] = curve;
       score[i] = (rows_above >= 1 ? (hit_up > 0.0F ? 1.0F : hidden_up) : 0.0F) +
                  (rows_below >= 1 ? (hit_down > 0.0F ? 1.0F : hidden_down) : 0.0F);
       rows[i] = hit_up + hit_down;
       unlike[i] = hit_up * std::min(std::abs(next_width[0][i] - W[i]), 3.0F) +
                   hit_down * std::min(std::abs(next_width[1][i] - W[i]), 3.0F);
-      // Without a return beside it there is no line to follow.
-      next[0][i] = up + down;
+      followed[i] = up + down;
     }
     for (const int k : {2, -2, 3, -3}) {
       const bool inside = k > 0 ? k <= rows_above : -k <= rows_below;
@@ -132,7 +131,7 @@ void TrySlopes(const float* range,
       const float steps = static_cast<float>(k);
       const float wider = 1.0F + 0.3F * std::abs(steps);
       for (std::size_t i = 0; i < kLanes; ++i) {
-        const float expected = R[i] + steps * depth[i] + 0.5F * steps * steps * second[i];
+        const float expected = R[i] + steps * depth[i] + 0.5F * steps * steps * curve[i];
         const float close = tolerance[i] * wider;
         const float a = r[static_cast<std::ptrdiff_t>(i) - 1];
         const float b = r[i];
@@ -144,9 +143,9 @@ void TrySlopes(const float* range,
         const float wb = std::abs(b - expected) < close ? std::abs(u[i] - W[i]) : 1e6F;
         const float wc = std::abs(c - expected) < close ? std::abs(u[i + 1] - W[i]) : 1e6F;
         const float likest = std::min(std::min(wa, wb), wc);
-        const float hit = likest < 1e5F && next[0][i] > 0.0F ? 1.0F : 0.0F;
-        const float else_ = low < expected - tolerance[i] ? 0.0F : -1.0F;
-        score[i] += hit > 0.0F ? 1.0F : else_;
+        const float hit = likest < 1e5F && followed[i] > 0.0F ? 1.0F : 0.0F;
+        const float missed = low < expected - tolerance[i] ? 0.0F : -1.0F;
+        score[i] += hit > 0.0F ? 1.0F : missed;
         rows[i] += hit;
         unlike[i] += hit > 0.0F ? std::min(likest, 3.0F) : 0.0F;
       }
