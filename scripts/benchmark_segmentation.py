@@ -4,6 +4,7 @@
     scripts/setup_oracles onnxruntime
     build/oracles/bin/python scripts/benchmark_segmentation.py [--passes N] [--json]
     build/oracles/bin/python scripts/benchmark_segmentation.py --agreement 100
+    scripts/benchmark_segmentation.py --scenes [--rows 32 --cols 360] [--weights FILE] [--scans N] [--seed N]
 
 The peer is ERFNet as published (Romera et al. 2018: 2.06 million parameters), with the five planes of
 RangeNet++ and two classes, exported from PyTorch into a temporary folder, run by ONNX Runtime on one
@@ -12,6 +13,9 @@ process, so that what else runs on the machine weighs little. The ratio is the m
 
 --agreement N simulates N scans, never trained on, runs them through the C++ network and through
 PyTorch and prints the largest difference of a logit and the part of the pixels with the same label.
+
+--scenes scores the scenes of config/scenes/ along their paths and --scans scans of every kind of random scene
+(score_segmentation), none of them trained on, and prints a table per scene and range.
 """
 import argparse
 import json
@@ -160,6 +164,52 @@ def agreement(args):
             "same_label": same / total, "pixels": total}
 
 
+# Scene, path, and which scans of it are scored.
+SCENES = [("thesis_tree", "thesis_quadrangle", 100), ("thesis_tree_pillars", "thesis_quadrangle", 100),
+          ("saguaro", "circle", 60), ("savanna", "savanna_walk", 20), ("orchard_row", "orchard_walk", 60),
+          ("palo_verde", "helix", 60)]
+
+
+def scene_scores(args):
+    """The scores of score_segmentation by scene or kind of random scene."""
+    image = ["--rows", str(args.rows), "--cols", str(args.cols)] + ([] if args.rows == 16 else ["--model", "uniform"])
+    weights = ["--weights", str(args.weights)] if args.weights else []
+
+    def score(*options):
+        output = subprocess.run([str(PROGRAMS / "score_segmentation"), "--methods", "network", *image, *weights, *options],
+                                check=True, capture_output=True, text=True).stdout
+        return json.loads(output)["network"]
+
+    scores = {}
+    for scene, path, every in SCENES:
+        result = score("--scene", str(ROOT / f"config/scenes/{scene}.yaml"),
+                       "--path", str(ROOT / f"config/paths/{path}.yaml"), "--every", str(every))
+        scores[f"{scene}, {path}"] = next(iter(result.values()))
+    scores.update({f"random, {kind}": entry for kind, entry in score(
+        "--scans", str(args.scans), "--scans-per-scene", "2", "--seed", str(args.seed)).items()})
+    return scores
+
+
+def scene_table(scores):
+    """A Markdown table: all ranges, then IoU / recall of wood by range."""
+    bins = list(next(iter(scores.values()))["by_range"])
+    lines = ["| scene | wood IoU | accuracy | recall | beyond 8 m | " +
+             " | ".join(name.replace("16-200m", "over 16m").replace("m", " m") for name in bins) + " | ms |",
+             "|---" * (6 + len(bins)) + "|"]
+
+    def show(value):
+        return "-" if value is None else f"{value:.3f}"
+
+    for name, entry in scores.items():
+        # A handful of pixels says nothing.
+        ranges = [f"{show(r['wood_iou'])} / {show(r['wood_recall'])}" if r["wood_pixels"] >= 50 else "-"
+                  for r in entry["by_range"].values()]
+        lines.append(f"| {name} | {show(entry['wood_iou'])} | {entry['accuracy']:.4f} | {show(entry['wood_recall'])} | "
+                     f"{show(entry['wood_recall_beyond_8m'])} | " + " | ".join(ranges) +
+                     f" | {entry['cpu_ms_median']:.1f} |")
+    return "\n".join(lines)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weights", type=pathlib.Path, help="default: the shipped ones")
@@ -167,8 +217,15 @@ def main():
     parser.add_argument("--cols", type=int, default=1800)
     parser.add_argument("--passes", type=int, default=60)
     parser.add_argument("--agreement", type=int, default=0, metavar="SCANS")
+    parser.add_argument("--scenes", action="store_true")
+    parser.add_argument("--scans", type=int, default=24, help="of every kind of random scene, with --scenes")
+    parser.add_argument("--seed", type=int, default=5000000, help="of the first random scene, with --scenes")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    if args.scenes:
+        scores = scene_scores(args)
+        print(json.dumps(scores) if args.json else scene_table(scores))
+        return
     result = agreement(args) if args.agreement else time_beside_onnx_runtime(args)
     if args.json:
         print(json.dumps(result))

@@ -10,7 +10,7 @@ namespace {
 constexpr double kPi = 3.14159265358979323846;
 constexpr float kNone = 1000.0F;  // Range of a pixel without a return [m].
 constexpr int kReach = 3;         // Rows looked at above and below.
-constexpr std::size_t kLanes = 32;  // Pixels of a row that are worked on together.
+constexpr std::size_t kLanes = 16;  // Pixels of a row that are worked on together.
 
 // Ranges and widths with `kReach` rows and `margin` columns more on every side.
 struct Padded {
@@ -58,12 +58,13 @@ void TrySlopes(const float* range,
                float row_gap,
                float col_gap,
                Block* block) {
-  Lanes R, W, gap, tolerance;
+  Lanes R, W, gap, tolerance, inverse;
   for (std::size_t i = 0; i < kLanes; ++i) {
     R[i] = range[i];
     W[i] = width[i];
     gap[i] = R[i] * row_gap;
     tolerance[i] = 0.03F + 0.004F * R[i];
+    inverse[i] = 1.0F / R[i];
     block->best[i] = -99.0F;
     block->sum[i] = 0.0F;
   }
@@ -107,7 +108,7 @@ void TrySlopes(const float* range,
       const float both = up * down;
       const float one = up > 0.0F ? next[0][i] - R[i] : down > 0.0F ? R[i] - next[1][i] : 0.0F;
       const float s = both > 0.0F ? 0.5F * (next[0][i] - next[1][i]) : one;
-      curve[i] = R[i] * angle + 2.0F * s * s / R[i];
+      curve[i] = R[i] * angle + 2.0F * s * s * inverse[i];
       const float t = both > 0.0F ? std::abs(next[0][i] + next[1][i] - 2.0F * R[i] - curve[i]) : 0.0F;
       const float straight = t < 2.0F * tolerance[i] ? 1.0F : 0.0F;
       const float hit_up = up * straight;
@@ -157,12 +158,16 @@ void TrySlopes(const float* range,
       const bool better = rank > block->best[i];
       block->best[i] = better ? rank : block->best[i];
       block->rows[i] = better ? rows[i] : block->rows[i];
-      block->bend[i] = better ? bend[i] / tolerance[i] : block->bend[i];
-      block->depth[i] = better ? depth[i] / gap[i] : block->depth[i];
+      block->bend[i] = better ? bend[i] : block->bend[i];
+      block->depth[i] = better ? depth[i] : block->depth[i];
       block->slope[i] = better ? slope : block->slope[i];
       block->likeness[i] = better ? mean : block->likeness[i];
       block->sum[i] += score[i];
     }
+  }
+  for (std::size_t i = 0; i < kLanes; ++i) {
+    block->bend[i] /= tolerance[i];
+    block->depth[i] /= gap[i];
   }
 }
 

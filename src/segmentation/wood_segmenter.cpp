@@ -56,6 +56,10 @@ void WoodSegmenterConfig::Validate() const {
   if (!(wood_threshold > 0.0 && wood_threshold < 1.0)) {
     throw std::invalid_argument("wood_threshold must be in (0, 1)");
   }
+  if (!(far_range_m > 0.0)) throw std::invalid_argument("far_range_m must be > 0");
+  if (!(far_wood_threshold > 0.0 && far_wood_threshold < 1.0)) {
+    throw std::invalid_argument("far_wood_threshold must be in (0, 1)");
+  }
   if (margin_columns < 0) throw std::invalid_argument("margin_columns must be >= 0");
   if (num_threads < 1) throw std::invalid_argument("num_threads must be >= 1");
   ground.Validate();
@@ -220,7 +224,8 @@ struct WoodSegmenter::Impl {
         for (std::size_t k = 0; k < kClasses; ++k) sum += std::exp(logit[k * plane] - highest);
         const float wood = std::exp(logit[kWoodClass * plane] - highest) / sum;
         int best = 0;
-        if (wood >= static_cast<float>(config.wood_threshold)) {
+        const bool far = image.range[pixel] > static_cast<float>(config.far_range_m);
+        if (wood >= static_cast<float>(far ? config.far_wood_threshold : config.wood_threshold)) {
           best = kWoodClass;
         } else {
           for (int k = 1; k < kClasses; ++k) {

@@ -157,6 +157,26 @@ TEST(WoodSegmenterNetwork, RollingTheScanRollsTheLabels) {
   }
 }
 
+TEST(WoodSegmenterNetwork, FarReturnsHaveAThresholdOfTheirOwn) {
+  const TrainingScan scan =
+      SimulateTrainingScans("distant", 7400000U, 1, Lidar(), ProjectorConfig()).front();
+  WoodSegmenterConfig config;
+  config.wood_threshold = 0.6;
+  config.far_range_m = 9.0;
+  config.far_wood_threshold = 0.2;
+  WoodSegmenter segmenter(config);
+  const LabelledScan result = segmenter.Segment(scan.image);
+  int between = 0;
+  for (std::size_t i = 0; i < result.label.size(); ++i) {
+    if (!scan.image.HasReturn(i)) continue;
+    const float range = scan.image.range[i];
+    const float probability = result.wood_probability[i];
+    ASSERT_EQ(result.IsWood(i), probability >= (range > 9.0F ? 0.2F : 0.6F)) << range << " " << probability;
+    between += range > 9.0F && probability >= 0.2F && probability < 0.6F;
+  }
+  EXPECT_GT(between, 0);
+}
+
 TEST(WoodSegmenterNetwork, SameInputSameBytesAlsoWithTwoThreads) {
   const TrainingScan scan =
       SimulateTrainingScans("leafless", 7200000U, 1, Lidar(), ProjectorConfig()).front();
@@ -266,6 +286,12 @@ TEST(WoodSegmenter, RefusesBadConfigurationNamingTheField) {
   config = {};
   config.wood_threshold = 1.5;
   expect(config, "wood_threshold");
+  config = {};
+  config.far_range_m = std::numeric_limits<double>::quiet_NaN();
+  expect(config, "far_range_m");
+  config = {};
+  config.far_wood_threshold = 0.0;
+  expect(config, "far_wood_threshold");
   config = {};
   config.num_threads = 0;
   expect(config, "num_threads");

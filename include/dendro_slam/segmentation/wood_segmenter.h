@@ -16,6 +16,8 @@ struct WoodSegmenterConfig {
   double min_range_m = 0.4;        ///< Nearer returns are of the carrier: `other` [m]. >= 0.
   double max_range_m = 30.0;       ///< Farther returns are ground or other, never wood [m].
   double wood_threshold = 0.5;     ///< Wood if its probability is at least this. In (0, 1).
+  double far_range_m = 8.0;        ///< Farther returns are wood from `far_wood_threshold` on [m]. > 0.
+  double far_wood_threshold = 0.5; ///< What lies far is few pixels, and missed for good if missed. In (0, 1).
   int margin_columns = 32;         ///< Context on both sides of an occupied sector. >= 0.
   bool skip_bare_ground = true;    ///< Do not run the network on columns of nothing but ground.
   int num_threads = 1;             ///< Threads of the network; the setting is OpenCV's. >= 1.
@@ -30,6 +32,8 @@ struct WoodSegmenterConfig {
     v("min_range_m", min_range_m);
     v("max_range_m", max_range_m);
     v("wood_threshold", wood_threshold);
+    v("far_range_m", far_range_m);
+    v("far_wood_threshold", far_wood_threshold);
     v("margin_columns", margin_columns);
     v("skip_bare_ground", skip_bare_ground);
     v("num_threads", num_threads);
