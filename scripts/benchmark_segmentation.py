@@ -192,7 +192,7 @@ def scene_scores(args):
 
 def scene_table(scores):
     """A Markdown table: all ranges, then IoU / recall of wood by range."""
-    bins = list(next(iter(scores.values()))["by_range"])
+    bins = sorted(next(iter(scores.values()))["by_range"], key=lambda name: float(name.split("-")[0]))
     lines = ["| scene | wood IoU | accuracy | recall | beyond 8 m | " +
              " | ".join(name.replace("16-200m", "over 16m").replace("m", " m") for name in bins) + " | ms |",
              "|---" * (6 + len(bins)) + "|"]
@@ -203,7 +203,7 @@ def scene_table(scores):
     for name, entry in scores.items():
         # A handful of pixels says nothing.
         ranges = [f"{show(r['wood_iou'])} / {show(r['wood_recall'])}" if r["wood_pixels"] >= 50 else "-"
-                  for r in entry["by_range"].values()]
+                  for r in (entry["by_range"][name] for name in bins)]
         lines.append(f"| {name} | {show(entry['wood_iou'])} | {entry['accuracy']:.4f} | {show(entry['wood_recall'])} | "
                      f"{show(entry['wood_recall_beyond_8m'])} | " + " | ".join(ranges) +
                      f" | {entry['cpu_ms_median']:.1f} |")

@@ -17,7 +17,7 @@ struct WoodSegmenterConfig {
   double max_range_m = 30.0;       ///< Farther returns are ground or other, never wood [m].
   double wood_threshold = 0.5;     ///< Wood if its probability is at least this. In (0, 1).
   double far_range_m = 8.0;        ///< Farther returns are wood from `far_wood_threshold` on [m]. > 0.
-  double far_wood_threshold = 0.5; ///< What lies far is few pixels, and missed for good if missed. In (0, 1).
+  double far_wood_threshold = 0.2; ///< What lies far is few pixels, and missed for good if missed. In (0, 1).
   int margin_columns = 32;         ///< Context on both sides of an occupied sector. >= 0.
   bool skip_bare_ground = true;    ///< Do not run the network on columns of nothing but ground.
   int num_threads = 1;             ///< Threads of the network; the setting is OpenCV's. >= 1.
