@@ -37,6 +37,11 @@ import train_segmentation as training  # noqa: E402
 PROGRAMS = training.PROGRAMS
 
 
+def canvas_columns(cols):
+    """Columns the network is run on: empty ones fill up what its strides do not divide."""
+    return -(-cols // 16) * 16
+
+
 class PlainDown(nn.Module):
     def __init__(self, c_in, c_out):
         super().__init__()
@@ -104,7 +109,8 @@ def time_beside_onnx_runtime(args):
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
         rng = np.random.default_rng(1)
-        rng.standard_normal((1, training.PLANES, args.rows, args.cols), np.float32).tofile(folder / "planes.f32")
+        width = canvas_columns(args.cols)
+        rng.standard_normal((1, training.PLANES, args.rows, width), np.float32).tofile(folder / "planes.f32")
         x = rng.standard_normal((1, 5, args.rows, args.cols), np.float32)
         net = plain_erfnet()
         torch.onnx.export(net, torch.from_numpy(x), str(folder / "plain.onnx"), opset_version=13)
@@ -113,7 +119,7 @@ def time_beside_onnx_runtime(args):
         session = onnxruntime.InferenceSession(str(folder / "plain.onnx"), options,
                                                providers=["CPUExecutionProvider"])
         name = session.get_inputs()[0].name
-        ours = Passes(args.weights, folder / "planes.f32", args.rows, args.cols)
+        ours = Passes(args.weights, folder / "planes.f32", args.rows, width)
         pairs = []
         for k in range(args.passes + 3):
             cpu = ours.run(0)[1]
@@ -144,13 +150,15 @@ def agreement(args):
                         str(args.agreement), "--seed", "6000000", "--rows", str(args.rows), "--cols",
                         str(args.cols)] + ([] if native else ["--model", "uniform"]), check=True)
         data = training.Dataset([folder / "scans"])
-        planes = np.stack(data.planes).astype(np.float32)
+        width = canvas_columns(args.cols)
+        planes = np.zeros((args.agreement, training.PLANES, args.rows, width), np.float32)
+        planes[..., :args.cols] = np.stack(data.planes)
         planes.tofile(folder / "planes.f32")
-        passes = Passes(weights, folder / "planes.f32", args.rows, args.cols, folder / "logits.f32")
+        passes = Passes(weights, folder / "planes.f32", args.rows, width, folder / "logits.f32")
         for i in range(args.agreement):
             passes.run(i)
         passes.close()
-        logits = np.fromfile(folder / "logits.f32", np.float32).reshape(args.agreement, -1, args.rows, args.cols)
+        logits = np.fromfile(folder / "logits.f32", np.float32).reshape(args.agreement, -1, args.rows, width)
     worst, same, total, largest = 0.0, 0, 0, 0.0
     with torch.no_grad():
         for i in range(args.agreement):

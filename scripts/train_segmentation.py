@@ -935,7 +935,7 @@ def main():
     parser.add_argument("--joint-rate", type=float, default=2e-3, help="peak learning rate of the joint step")
     parser.add_argument("--steps", type=int, default=100, help="per epoch")
     parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--width", type=int, default=320, help="columns of a crop, a multiple of 8")
+    parser.add_argument("--width", type=int, default=320, help="columns of a crop, a multiple of 16")
     parser.add_argument("--score-every", type=int, default=5, help="epochs")
     parser.add_argument("--patience", type=int, default=20, help="scores without a better one")
     parser.add_argument("--minutes", type=float, default=0,
