@@ -858,7 +858,8 @@ Wood, ground, leaf and other in a range image. Written by `scripts/train_segment
   {training.rows} x {args.width} each; AdamW, cross-entropy and soft IoU of wood, averaged weights; seed {args.seed};
   {'bfloat16' if args.bfloat16 else 'float32'}, {state['seconds'] / 60:.0f} min on {args.device}
 - Started from: {args.init or 'random numbers'}
-- Augmentation: yaw (place of the crop), mirror, range scale, drop-out, intensity gain and off, ground unknown
+- Augmentation: yaw (place of the crop), mirror, head down, range scale, drop-out, intensity gain (of the scan, and of
+  each class) and off, ground unknown
 - Early stopping: the weights with the best wood IoU on a part of the held-out scans ({state['best']:.4f})
 
 ## Scores per pixel, mixed pixels and all
@@ -924,8 +925,8 @@ def main():
     parser.add_argument("--data", type=pathlib.Path,
                         help="folder of the simulated scans and the checkpoint")
     parser.add_argument("--output", type=pathlib.Path, help="default: config/models/")
-    parser.add_argument("--train-scans", type=int, default=4800)
-    parser.add_argument("--folders", type=int, default=6, help="that the training scans are spread over")
+    parser.add_argument("--train-scans", type=int, default=12000, help="1.2 MB each on the disk")
+    parser.add_argument("--folders", type=int, default=15, help="that the training scans are spread over")
     parser.add_argument("--test-scans", type=int, default=192)
     parser.add_argument("--held-out-scans", type=int, default=40, help="scored during the training")
     parser.add_argument("--layers")
@@ -933,10 +934,10 @@ def main():
     parser.add_argument("--decoder-epochs", type=int, default=4)
     parser.add_argument("--joint-epochs", type=int, default=300)
     parser.add_argument("--joint-rate", type=float, default=2e-3, help="peak learning rate of the joint step")
-    parser.add_argument("--steps", type=int, default=100, help="per epoch")
+    parser.add_argument("--steps", type=int, default=200, help="per epoch")
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--width", type=int, default=320, help="columns of a crop, a multiple of 16")
-    parser.add_argument("--score-every", type=int, default=5, help="epochs")
+    parser.add_argument("--score-every", type=int, default=15, help="epochs")
     parser.add_argument("--patience", type=int, default=20, help="scores without a better one")
     parser.add_argument("--minutes", type=float, default=0,
                         help="of training at most, the learning rate falls accordingly; 0: no limit")
