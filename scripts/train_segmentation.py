@@ -670,6 +670,12 @@ class Team:
             at += grad.numel()
         return float(flat[-1])
 
+    def part(self):
+        """Waits for the others, so that none hangs up on one that is still talking."""
+        if self.size > 1:
+            torch.distributed.barrier()
+            torch.distributed.destroy_process_group()
+
     def agree(self, yes):
         """What the first process says."""
         if self.size == 1:
@@ -817,6 +823,7 @@ def train_member(rank, args, meeting):
             break
         if not team.agree(state["stale"] < args.patience):
             break
+    team.part()
     if rank != 0:
         return
     best = ErfNet(args.layers)

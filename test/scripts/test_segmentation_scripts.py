@@ -45,7 +45,7 @@ def test_training_from_nothing_and_resumed(tmp_path):
     card = (tmp_path / "weights.md").read_text()
     assert "4 scans to train" in card and "2 epochs joint" in card
     # Exported weights are trained on in the joint step alone.
-    more = run("--joint-epochs", "1", "--init", str(tmp_path / "weights.safetensors"), "--processes", "2")
+    more = run("--joint-epochs", "1", "--init", str(tmp_path / "weights.safetensors"))
     assert "[1/1] phase=joint" in more and "phase=encoder" not in more
 
 
